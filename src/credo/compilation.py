@@ -1,0 +1,39 @@
+"""Compiling: one `jit` for the whole library, and a cache that outlives the process."""
+
+import functools
+import os
+import pathlib
+
+import equinox as eqx
+import jax
+import numpy as np
+
+cache_directory = pathlib.Path(
+    os.environ.get("CREDO_CACHE")
+    or pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "credo"
+)
+
+
+def jit(function):
+    """`equinox.filter_jit` that treats Python floats as data.
+
+    Under plain `filter_jit` a float is part of the program, so a new mutation strength or γ
+    compiles again. Sizes (`int`, `str`, `bool`) stay part of the program.
+    """
+    compiled = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        args, kwargs = jax.tree.map(
+            lambda x: np.asarray(x, np.float32) if isinstance(x, float) else x, (args, kwargs)
+        )
+        return compiled(*args, **kwargs)
+
+    return call
+
+
+def enable_cache() -> None:
+    """Keep compiled programs in `~/.cache/credo` (or `$CREDO_CACHE`) between processes."""
+    jax.config.update("jax_compilation_cache_dir", str(cache_directory / "xla"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)

@@ -1,0 +1,98 @@
+"""The contract every environment keeps, and the one for labelled sequences."""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+
+from ..types import Sequence, TimeStep
+
+
+class AbstractEnvironment(eqx.Module):
+    """One episode of one task as two pure functions.
+
+    No automatic reset and no batch axis: rollouts decide when to stop, `jax.vmap` decides how
+    many. Observations are finite float32; actions lie in [-1, 1]. For a team both have a leading
+    agent axis and `agents` says how many.
+    """
+
+    obs_size: eqx.AbstractVar[int]
+    action_size: eqx.AbstractVar[int]
+    max_steps: eqx.AbstractVar[int]  # no episode is longer
+    signals: eqx.AbstractVar[tuple[str, ...]]
+    """Names of the rewards. The first is what training maximises and the last is what is
+    reported, unless an algorithm says otherwise."""
+    agents: ClassVar[int | None] = None
+
+    @abc.abstractmethod
+    def reset(self, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
+        """A fresh episode. The rewards of this first time step are 0."""
+
+    @abc.abstractmethod
+    def step(
+        self, state: PyTree, action: Float[Array, "*agents act"], *, key: PRNGKeyArray
+    ) -> tuple[PyTree, TimeStep]:
+        """One transition. After the end (terminated or truncated) its result is ignored."""
+
+
+class SequenceState(eqx.Module):
+    sequence: Sequence
+    step: Int[Array, ""]
+    perfect: Bool[Array, ""]  # every scored answer so far was right
+
+
+class AbstractSequenceTask(AbstractEnvironment):
+    """Read a sequence, answer at each step with one number in [-1, 1].
+
+    A task says how to `sample` a labelled sequence and what an answer earns; the environment
+    below and the fast path of `rollout.evaluate` both follow from that.
+    Signals: `fitness`, the sum of `reward` over all steps before the padding; and `success`, 1 at
+    the last step if every scored answer of the sequence was right.
+    """
+
+    action_size: ClassVar[int] = 1
+    signals: ClassVar[tuple[str, ...]] = ("fitness", "success")
+
+    @abc.abstractmethod
+    def sample(self, *, key: PRNGKeyArray) -> Sequence:
+        """One sequence, padded to `max_steps`."""
+
+    @abc.abstractmethod
+    def reward(
+        self,
+        answer: Float[Array, "*batch"],
+        target: Float[Array, "*batch"],
+        scored: Bool[Array, "*batch"],
+        perfect: Bool[Array, "*batch"],
+    ) -> Float[Array, "*batch"]:
+        """What one answer earns, elementwise. `perfect`: every scored answer of this sequence
+        was right, this one included."""
+
+    def reset(self, *, key: PRNGKeyArray) -> tuple[SequenceState, TimeStep]:
+        sequence = self.sample(key=key)
+        state = SequenceState(sequence, jnp.int32(0), jnp.bool_(True))
+        return state, _time_step(state, jnp.float32(0.0), jnp.float32(0.0))
+
+    def step(
+        self, state: SequenceState, action: Float[Array, " 1"], *, key: PRNGKeyArray
+    ) -> tuple[SequenceState, TimeStep]:
+        sequence, step = state.sequence, state.step
+        target, scored = sequence.targets[step], sequence.scored[step]
+        perfect = state.perfect & (~scored | correct(action[0], target))
+        reward = self.reward(action[0], target, scored, perfect)
+        state = SequenceState(sequence, step + 1, perfect)
+        success = jnp.where(state.step >= sequence.length, perfect.astype(jnp.float32), 0.0)
+        return state, _time_step(state, reward, success)
+
+
+def correct(answer: Float[Array, "*b"], target: Float[Array, "*b"]) -> Bool[Array, "*b"]:
+    """An answer of 0 or more means class +1. A target of 0 accepts anything."""
+    return (target == 0) | ((answer >= 0) == (target > 0))
+
+
+def _time_step(state: SequenceState, reward: Array, success: Array) -> TimeStep:
+    ended = state.step >= state.sequence.length
+    obs = state.sequence.inputs[jnp.minimum(state.step, state.sequence.length - 1)]
+    return TimeStep(obs, {"fitness": reward, "success": success}, ended, jnp.bool_(False))

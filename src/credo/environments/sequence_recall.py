@@ -1,0 +1,87 @@
+"""Sequence Recall, also called deep T-maze: hear `depth` directions, then take them in order.
+
+Source: Khadka (2019), section 3.3 and Figure 3.8.
+Inputs are [signal, distance to the next junction]. The first `depth` steps show the directions ±1
+while the distance holds the first corridor's length; then each corridor of length L counts the
+distance down from L-1 to 0 with a signal of 0. The answer at distance 0 is the turn; all turns
+right, in order, is success.
+
+Departures from the dissertation:
+
+- Distances are divided by `max_corridor`, so that they lie in [0, 1] (`scaled=False` gives the
+  author's raw integers).
+- One encoding for evolution and gradient; the author's gradient version used another.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from ..types import Sequence
+from .base import AbstractSequenceTask
+
+
+class SequenceRecall(AbstractSequenceTask):
+    """Directions first, then corridors; the turns count.
+
+    The reward is the author's: at a junction [½·t·y + ½·(every turn so far was right)] / depth,
+    with t the direction ±1 and y the answer in [-1, 1]. So an episode earns -½..1.
+    """
+
+    depth: int = eqx.field(static=True, default=6)  # directions and junctions, at least 1
+    min_corridor: int = eqx.field(static=True, default=10)  # steps per corridor, at least 1
+    max_corridor: int = eqx.field(static=True, default=20)  # steps per corridor, at most
+    scaled: bool = eqx.field(static=True, default=True)  # distances in [0, 1] in place of steps
+
+    def __check_init__(self):
+        if self.depth < 1:
+            raise ValueError(f"depth is {self.depth}: it must be at least 1 junction")
+        if not 1 <= self.min_corridor <= self.max_corridor:
+            raise ValueError(
+                f"corridors of {self.min_corridor}..{self.max_corridor} steps: "
+                "needs 1 <= min_corridor <= max_corridor"
+            )
+
+    @property
+    def obs_size(self) -> int:
+        return 2
+
+    @property
+    def max_steps(self) -> int:
+        return self.depth + self.depth * self.max_corridor
+
+    def sample(self, *, key: PRNGKeyArray) -> Sequence:
+        direction_key, corridor_key = jax.random.split(key)
+        directions = jax.random.rademacher(direction_key, (self.depth,), jnp.float32)
+        corridors = jax.random.randint(
+            corridor_key, (self.depth,), self.min_corridor, self.max_corridor + 1
+        )
+        return self.lay_out(directions, corridors)
+
+    def lay_out(
+        self, directions: Float[Array, " depth"], corridors: Int[Array, " depth"]
+    ) -> Sequence:
+        """The maze with these directions ±1 and corridor lengths, each at most `max_corridor`."""
+        step = jnp.arange(self.max_steps)
+        junction = self.depth - 1 + jnp.cumsum(corridors)  # the step at distance 0
+        corridor = jnp.minimum(jnp.searchsorted(junction, step), self.depth - 1)
+        instructing = step < self.depth
+        distance = jnp.where(instructing, corridors[0], jnp.maximum(junction[corridor] - step, 0))
+        signal = jnp.where(instructing, directions[jnp.minimum(step, self.depth - 1)], 0.0)
+        scored = jnp.zeros(self.max_steps, bool).at[junction].set(True)
+        distance = distance.astype(jnp.float32) / (self.max_corridor if self.scaled else 1)
+        # The target holds along the corridor (gradient may learn from every step of it), but only
+        # the junction is scored.
+        targets = jnp.where(instructing, 0.0, directions[corridor])
+        return Sequence(jnp.stack([signal, distance], axis=1), targets, scored, junction[-1] + 1)
+
+    def reward(
+        self,
+        answer: Float[Array, "*b"],
+        target: Float[Array, "*b"],
+        scored: Bool[Array, "*b"],
+        perfect: Bool[Array, "*b"],
+    ) -> Float[Array, "*b"]:
+        earned = 0.5 * target * answer + 0.5 * perfect.astype(jnp.float32)
+        return jnp.where(scored, earned, 0.0) / self.depth

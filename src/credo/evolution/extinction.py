@@ -1,0 +1,24 @@
+"""Extinction: now and then most of a population dies out and is seeded anew."""
+
+import equinox as eqx
+import jax
+from jaxtyping import PRNGKeyArray, PyTree
+
+from .. import tree
+
+
+class Extinction(eqx.Module):
+    """With `probability` per generation each member is replaced by a fresh one with chance
+    `magnitude` (Khadka 2019, Algorithms 4 and 5)."""
+
+    probability: float = 0.004  # per generation, in [0, 1]
+    magnitude: float = 0.5  # share of the members that dies, in [0, 1]
+
+    def __call__(self, population: PyTree, fresh: PyTree, *, key: PRNGKeyArray) -> PyTree:
+        """`population` and `fresh` `[pop, ...]`; spare the elites by not passing them."""
+        event_key, member_key = jax.random.split(key)
+        event = jax.random.bernoulli(event_key, self.probability)
+        dies = event & jax.random.bernoulli(
+            member_key, self.magnitude, (tree.size(population),)
+        )
+        return eqx.filter_vmap(tree.where)(dies, fresh, population)

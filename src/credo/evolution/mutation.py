@@ -1,0 +1,98 @@
+"""Mutation: one genome in, one out. Any pytree is a genome; `jax.vmap` makes it act on many."""
+
+import abc
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+
+from .. import tree
+
+
+class AbstractMutation(eqx.Module):
+    @abc.abstractmethod
+    def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
+        """A changed copy, of the same structure, shapes and dtypes."""
+
+
+class MatrixMutation(AbstractMutation):
+    """Perturb a sample of the entries of each weight matrix (Khadka 2019, Algorithms 2 and 8).
+
+    A gate with `probability` decides per matrix (Algorithm 2) or once per genome (the author's
+    sequence code). A gated matrix has `fraction` of its entries hit; each hit draws one of
+    three: *super* adds N(0, super_strength·|w|), *reset* draws N(0, reset_std) anew, otherwise
+    N(0, strength·|w|) is added. Results are clipped to ±`limit`.
+
+    Departure: the printed pseudo-code of Algorithms 8 and 12 multiplies, w·N(0, strength), which
+    would erase the weight; noise proportional to the weight is added, as the author's code does.
+    """
+
+    probability: float = 0.9  # chance of the gate, in [0, 1]
+    gate: Literal["matrix", "genome"] = eqx.field(static=True, default="matrix")
+    fraction: float = 0.1  # share of a matrix's entries that is hit, in [0, 1]
+    up_to_fraction: bool = eqx.field(static=True, default=False)
+    """Draw the share anew for each matrix, uniformly up to `fraction` and at least one entry."""
+    strength: float = 0.1  # std of the noise, relative to the weight
+    floor: float = 0.0  # std of further noise, absolute, so that small weights can move
+    super_probability: float = 0.0  # share of hits that are super, in [0, 1]
+    super_strength: float = 10.0  # std of the super noise, relative to the weight
+    reset_probability: float = 0.0  # share of hits that are resets, in [0, 1]
+    reset_std: float = 1.0  # std of a reset weight; 0 erases it
+    limit: float = 1e6  # largest magnitude of a weight
+
+    def __check_init__(self):
+        for name in ("probability", "fraction", "super_probability", "reset_probability"):
+            value = getattr(self, name)
+            if isinstance(value, float) and not 0.0 <= value <= 1.0:
+                raise ValueError(f"{name} is {value}: it must lie in [0, 1]")
+        if self.gate not in ("matrix", "genome"):
+            raise ValueError(f"gate is {self.gate!r}: it must be 'matrix' or 'genome'")
+
+    def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
+        gate_key, chosen_key, kind_key, noise_key, floor_key = jax.random.split(key, 5)
+        weights, rest = eqx.partition(genome, eqx.is_inexact_array)
+        leaves, treedef = jax.tree.flatten(weights)
+        gates = jax.random.bernoulli(gate_key, self.probability, (len(leaves),))
+        share = jax.random.uniform(jax.random.fold_in(gate_key, 1), (len(leaves),))
+        draws = (
+            jax.tree.leaves(tree.uniform_like(weights, key=chosen_key)),
+            jax.tree.leaves(tree.uniform_like(weights, key=kind_key)),
+            jax.tree.leaves(tree.normal_like(weights, key=noise_key)),
+            jax.tree.leaves(tree.normal_like(weights, key=floor_key)),
+        )
+        mutants = []
+        for leaf, (w, u, kind, noise, extra) in enumerate(zip(leaves, *draws, strict=True)):
+            gate = gates[0 if self.gate == "genome" else leaf]
+            hit = gate & self.chosen(u, share[leaf])
+            mutants.append(jnp.where(hit, self.moved(w, kind, noise, extra), w))
+        return eqx.combine(jax.tree.unflatten(treedef, mutants), rest)
+
+    def chosen(self, u: Float[Array, "..."], share: Float[Array, ""]) -> Bool[Array, "..."]:
+        """Which entries of a matrix are hit, from uniform `u`."""
+        if not self.up_to_fraction:
+            return u < self.fraction
+        most = jnp.ceil(self.fraction * u.size)
+        count = jnp.minimum(1.0 + jnp.floor(most * share), most)
+        return (u < count / u.size) | (u == jnp.min(u))
+
+    def moved(self, w, kind, noise, extra) -> Float[Array, "..."]:
+        """Every entry of a matrix as it is after a hit; `kind` uniform, the others normal."""
+        is_super = kind < self.super_probability
+        is_reset = ~is_super & (kind < self.super_probability + self.reset_probability)
+        strength = jnp.where(is_super, self.super_strength, self.strength)
+        hit = w + strength * jnp.abs(w) * noise + self.floor * extra
+        hit = jnp.where(is_reset, self.reset_std * extra, hit)
+        return jnp.clip(hit, -self.limit, self.limit)
+
+
+class GaussianMutation(AbstractMutation):
+    """Add N(0, std) to every weight: the plain mutation of evolution strategies."""
+
+    std: float = 0.1
+
+    def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
+        weights, rest = eqx.partition(genome, eqx.is_inexact_array)
+        noise = tree.normal_like(weights, key=key)
+        return eqx.combine(jax.tree.map(lambda w, n: w + self.std * n, weights, noise), rest)

@@ -1,0 +1,148 @@
+"""MMU, the Modular Memory Unit: a feed-forward network beside gated memory.
+
+Source: Khadka (2019), section 3.1, equations 3.1-3.5; Khadka, Chung & Tumer (2017).
+
+The defaults are the instance of Chapter 3: α = 0, identity encoder and decoder. Departures from
+the text, which leaves φ and θ open and calls encoder and decoder the identity:
+
+- The encoder keeps a tanh around its identity matrix, so that one write moves a cell by at most
+  1; the decoder keeps none. Only so are the published memory states possible (Table 3.2: steps
+  of .66, .90, .98, 1.00, and a cell that counts to 10^6).
+- φ is the sigmoid, as in the author's code. The output y is fed back as it is, in [0, 1]; the
+  action is 2y - 1.
+- The memory starts from a leaf of its own, `m_0`, that evolution can move. The author's code
+  drew it once and never changed it.
+- The block input sees memory (equation 3.1); the author's code fed it the last output.
+"""
+
+from typing import ClassVar, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .base import (
+    ACTIVATIONS,
+    INITIALIZERS,
+    AbstractNetwork,
+    AbstractPolicy,
+    at_least,
+    choose,
+    draw,
+    matvec,
+    to_action,
+)
+
+
+class MMU(AbstractNetwork):
+    """Config of an MMU. All sizes are independent once encoder and decoder are learned."""
+
+    hidden: int = eqx.field(static=True, default=5)  # hidden activations h
+    memory: int | None = eqx.field(static=True, default=None)  # memory cells; None: as hidden
+    alpha: float = eqx.field(static=True, default=0.0)  # 0 cumulative … 1 interpolative update
+    encoder: Literal["identity", "learned"] = eqx.field(static=True, default="identity")
+    decoder: Literal["identity", "learned"] = eqx.field(static=True, default="identity")
+    block_activation: str = eqx.field(static=True, default="sigmoid")  # φ of equation 3.1
+    decoder_activation: str = eqx.field(static=True, default="identity")  # θ of equation 3.2
+    encoder_activation: str = eqx.field(static=True, default="tanh")  # θ of equation 3.4
+    output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
+    start_memory: Literal["learned", "zero"] = eqx.field(static=True, default="learned")
+    initializer: str = eqx.field(static=True, default="normal")  # normal, fan_in or kaiming
+
+    def __check_init__(self):
+        at_least("hidden", self.hidden, 1)
+        at_least("memory", self.cells, 1)
+        if not 0.0 <= self.alpha <= 1.0:
+            raise ValueError(f"alpha is {self.alpha}: it must lie in [0, 1]")
+        choose("encoder", self.encoder, ("identity", "learned"))
+        choose("decoder", self.decoder, ("identity", "learned"))
+        for name in ("block_activation", "decoder_activation", "encoder_activation"):
+            choose(name, getattr(self, name), ACTIVATIONS)
+        choose("output_activation", self.output_activation, ("sigmoid", "tanh"))
+        choose("start_memory", self.start_memory, ("learned", "zero"))
+        choose("initializer", self.initializer, INITIALIZERS)
+        if "identity" in (self.encoder, self.decoder) and self.cells != self.hidden:
+            raise ValueError(
+                f"hidden is {self.hidden} and memory is {self.cells}: an identity encoder or "
+                "decoder needs them equal; give both encoder='learned' and decoder='learned' "
+                "for memory of another size"
+            )
+
+    @property
+    def cells(self) -> int:
+        return self.hidden if self.memory is None else self.memory
+
+    def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> "MMUPolicy":
+        x, y, h, m = obs_size, action_size, self.hidden, self.cells
+        shapes: dict[str, tuple[int, ...]] = {}
+        for gate, size in (("i", h), ("r", h), ("w", m)):
+            shapes |= {f"K_{gate}": (size, x), f"R_{gate}": (size, y), f"N_{gate}": (size, m)}
+            shapes |= {f"b_{gate}": (size,)}
+        shapes |= {"K_p": (h, x), "N_p": (h, m), "b_p": (h,), "Z_y": (y, h), "b_y": (y,)}
+        if self.decoder == "learned":
+            shapes |= {"N_d": (h, m), "b_d": (h,)}
+        if self.encoder == "learned":
+            shapes |= {"Z_f": (m, h), "b_f": (m,)}
+        if self.start_memory == "learned":
+            shapes |= {"m_0": (m,)}
+        return MMUPolicy(config=self, **draw(shapes, self.initializer, key=key))
+
+
+class MMUPolicy(AbstractPolicy):
+    """The weights of an MMU, named as in equations 3.1-3.5. Frozen ones are `None`."""
+
+    features_first: ClassVar[bool] = True
+
+    config: MMU = eqx.field(static=True)
+    K_i: Float[Array, "h x"]
+    R_i: Float[Array, "h y"]
+    N_i: Float[Array, "h m"]
+    b_i: Float[Array, " h"]
+    K_p: Float[Array, "h x"]
+    N_p: Float[Array, "h m"]
+    b_p: Float[Array, " h"]
+    K_r: Float[Array, "h x"]
+    R_r: Float[Array, "h y"]
+    N_r: Float[Array, "h m"]
+    b_r: Float[Array, " h"]
+    K_w: Float[Array, "m x"]
+    R_w: Float[Array, "m y"]
+    N_w: Float[Array, "m m"]
+    b_w: Float[Array, " m"]
+    Z_y: Float[Array, "y h"]
+    b_y: Float[Array, " y"]
+    N_d: Float[Array, "h m"] | None = None
+    b_d: Float[Array, " h"] | None = None
+    Z_f: Float[Array, "m h"] | None = None
+    b_f: Float[Array, " m"] | None = None
+    m_0: Float[Array, " m"] | None = None
+
+    def start(self, *, key: PRNGKeyArray | None = None):
+        y = jnp.zeros_like(self.b_y)
+        return y, (jnp.zeros_like(self.b_w) if self.m_0 is None else self.m_0)
+
+    def __call__(self, obs, carry):
+        x, (y, m), c = obs, carry, self.config
+        σ = ACTIVATIONS["sigmoid"]
+        φ, θ_d, θ_f, φ_y = (
+            ACTIVATIONS[name]
+            for name in (
+                c.block_activation,
+                c.decoder_activation,
+                c.encoder_activation,
+                c.output_activation,
+            )
+        )
+        i = σ(matvec(self.K_i, x) + matvec(self.R_i, y) + matvec(self.N_i, m) + self.b_i)
+        p = φ(matvec(self.K_p, x) + matvec(self.N_p, m) + self.b_p)  # (3.1)
+        r = σ(matvec(self.K_r, x) + matvec(self.R_r, y) + matvec(self.N_r, m) + self.b_r)
+        d = θ_d(m if self.N_d is None else matvec(self.N_d, m) + self.b_d)  # (3.2)
+        h = r * d + p * i  # (3.3)
+        w = σ(matvec(self.K_w, x) + matvec(self.R_w, y) + matvec(self.N_w, m) + self.b_w)
+        f = θ_f(h if self.Z_f is None else matvec(self.Z_f, h) + self.b_f)
+        if c.alpha == 0.0:
+            m = m + w * f
+        else:
+            m = (1.0 - c.alpha) * (m + w * f) + c.alpha * (w * f + (1.0 - w) * m)  # (3.4)
+        y = φ_y(matvec(self.Z_y, h) + self.b_y)  # (3.5)
+        return to_action(y, c.output_activation), (y, m)

@@ -1,0 +1,40 @@
+"""The records that cross module borders. Every one is a pytree."""
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float, Int
+
+Metrics = dict[str, Array]  # one scalar per name
+
+
+class TimeStep(eqx.Module):
+    """What an environment says after `reset` or one `step` (one episode, no batch).
+
+    For a team, `obs` has a leading agent axis, a reward is a scalar (shared) or `[agents]`
+    (private), and `active` says who acts at the next step (busy, joined or left).
+    """
+
+    obs: Float[Array, "..."]
+    rewards: dict[str, Float[Array, "..."]]  # one entry per name in the environment's `signals`
+    terminated: Bool[Array, ""]  # the task ended: do not bootstrap
+    truncated: Bool[Array, ""]  # the clock ran out: do bootstrap
+    active: Bool[Array, " agents"] | None = None
+
+
+class Sequence(eqx.Module):
+    """One labelled sequence, padded to a fixed number of steps.
+
+    `targets` are signed: above 0 the right answer is +1, below 0 it is -1, at 0 anything goes.
+    Their size may carry meaning for a task's own reward (a running sum, say).
+    """
+
+    inputs: Float[Array, "time in"]
+    targets: Float[Array, " time"]
+    scored: Bool[Array, " time"]  # where the answer counts
+    length: Int[Array, ""]  # steps before the padding
+
+
+class Evaluation(eqx.Module):
+    """What a population earned: undiscounted sums of every reward signal."""
+
+    returns: dict[str, Float[Array, "pop episodes"]]
+    steps: Int[Array, "pop episodes"]  # environment steps taken; padding is not counted
