@@ -1,0 +1,49 @@
+"""Credo: credit assignment by evolution and gradient.
+
+    import credo
+
+    task = credo.SequenceClassification(depth=5)
+    algorithm = credo.Neuroevolution.ours(task, credo.MMU(hidden=5))
+    run = credo.train(algorithm, generations=300)
+    policy = run.policy()
+    action = policy(observation)
+"""
+
+import importlib
+
+_EXPORTS = {
+    "SequenceClassification": "environments.sequence_classification",
+    "SequenceRecall": "environments.sequence_recall",
+    "AbstractEnvironment": "environments.base",
+    "AbstractSequenceTask": "environments.base",
+    "check_environment": "environments.checks",
+    "MMU": "networks.mmu",
+    "Recurrent": "networks.recurrent",
+    "MLP": "networks.mlp",
+    "Tournament": "evolution.selection",
+    "Truncation": "evolution.selection",
+    "MatrixMutation": "evolution.mutation",
+    "GaussianMutation": "evolution.mutation",
+    "MaskedCrossover": "evolution.crossover",
+    "Extinction": "evolution.extinction",
+    "Neuroevolution": "algorithms.neuroevolution",
+    "Sequence": "types",
+    "TimeStep": "types",
+    "evaluate": "rollout",
+    "train": "runs.loop",
+    "resume": "runs.loop",
+    "Run": "runs.loop",
+    "Policy": "runs.loop",
+}
+__all__ = sorted(_EXPORTS)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str):
+    # Imported on first use, so that `credo --help` need not wait for JAX.
+    if name not in _EXPORTS:
+        raise AttributeError(f"module 'credo' has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_EXPORTS[name]}", __name__), name)
+
+
+def __dir__():
+    return __all__

@@ -9,6 +9,7 @@ Departures from the printed box:
 - Elites are never mutated. The author's program mutated them and kept an untouched copy.
 """
 
+from collections.abc import Callable
 from typing import Self
 
 import equinox as eqx
@@ -79,6 +80,15 @@ class Neuroevolution(eqx.Module):
             limit=1e12,
         )
         return cls(env, network, **{"mutation": mutation, "cross_repeated": True} | overrides)
+
+    @classmethod
+    def ours(cls, env: AbstractEnvironment, network: AbstractNetwork, **overrides) -> Self:
+        return cls.as_coded(env, network, **overrides)
+
+    @classmethod
+    def presets(cls) -> dict[str, Callable[..., Self]]:
+        """Settings by name, for the command line."""
+        return {"as-written": cls, "as-coded": cls.as_coded, "ours": cls.ours}
 
     @property
     def elites(self) -> int:

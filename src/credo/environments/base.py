@@ -1,6 +1,7 @@
 """The contract every environment keeps, and the one for labelled sequences."""
 
 import abc
+import math
 from typing import ClassVar
 
 import equinox as eqx
@@ -25,6 +26,8 @@ class AbstractEnvironment(eqx.Module):
     """Names of the rewards. The first is what training maximises and the last is what is
     reported, unless an algorithm says otherwise."""
     agents: ClassVar[int | None] = None
+    obs_range: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
+    """The least and the largest number in an observation."""
 
     @abc.abstractmethod
     def reset(self, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:

@@ -15,7 +15,7 @@ Departures from the dissertation:
   after the last signal.
 """
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -32,6 +32,8 @@ class SequenceClassification(AbstractSequenceTask):
     The reward is the author's: at every step clip(y·S, -1, 1), and 1 more at a signal where that
     product reaches 1, with S the running sum (plus ½ where a tie is class +1).
     """
+
+    obs_range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
 
     depth: int = eqx.field(static=True, default=21)  # signals per sequence, at least 1
     min_gap: int = eqx.field(static=True, default=10)  # zeros between two signals, at least

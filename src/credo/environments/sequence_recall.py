@@ -8,7 +8,7 @@ right, in order, is success.
 
 Departures from the dissertation:
 
-- Distances are divided by `max_corridor`, so that they lie in [0, 1] (`scaled=False` gives the
+- Distances are divided by `max_corridor`, so that they lie in [0, 1] (`unit=1` gives the
   author's raw integers).
 - One encoding for evolution and gradient; the author's gradient version used another.
 """
@@ -32,7 +32,8 @@ class SequenceRecall(AbstractSequenceTask):
     depth: int = eqx.field(static=True, default=6)  # directions and junctions, at least 1
     min_corridor: int = eqx.field(static=True, default=10)  # steps per corridor, at least 1
     max_corridor: int = eqx.field(static=True, default=20)  # steps per corridor, at most
-    scaled: bool = eqx.field(static=True, default=True)  # distances in [0, 1] in place of steps
+    unit: int | None = eqx.field(static=True, default=None)
+    """Steps per unit of distance; None: `max_corridor`, so that distances lie in [0, 1]."""
 
     def __check_init__(self):
         if self.depth < 1:
@@ -42,6 +43,10 @@ class SequenceRecall(AbstractSequenceTask):
                 f"corridors of {self.min_corridor}..{self.max_corridor} steps: "
                 "needs 1 <= min_corridor <= max_corridor"
             )
+
+    @property
+    def obs_range(self) -> tuple[float, float]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return -1.0, self.max_corridor / (self.unit or self.max_corridor)
 
     @property
     def obs_size(self) -> int:
@@ -70,7 +75,7 @@ class SequenceRecall(AbstractSequenceTask):
         distance = jnp.where(instructing, corridors[0], jnp.maximum(junction[corridor] - step, 0))
         signal = jnp.where(instructing, directions[jnp.minimum(step, self.depth - 1)], 0.0)
         scored = jnp.zeros(self.max_steps, bool).at[junction].set(True)
-        distance = distance.astype(jnp.float32) / (self.max_corridor if self.scaled else 1)
+        distance = distance.astype(jnp.float32) / (self.unit or self.max_corridor)
         # The target holds along the corridor (gradient may learn from every step of it), but only
         # the junction is scored.
         targets = jnp.where(instructing, 0.0, directions[corridor])

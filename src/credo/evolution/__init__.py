@@ -1,0 +1,1 @@
+"""What changes or picks genomes without a gradient."""

@@ -1,0 +1,319 @@
+"""Does an environment keep the contract? For those who bring their own."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray, PyTree
+
+from ..types import Sequence, TimeStep
+from .base import AbstractEnvironment, AbstractSequenceTask
+
+KEYS = 16  # episodes and sequences that are looked at
+
+
+def check_environment(env: AbstractEnvironment) -> list[str]:
+    """What is wrong with a JAX environment or sequence task, each with its fix; empty if nothing.
+
+    Plays 16 episodes of random actions, at most `2 * max_steps` steps each. Later checks need
+    what earlier ones established, so mend what is listed and check again. What the environment
+    itself raises, or JAX about its code, is not caught: it says more than a line here could.
+    """
+    if not isinstance(env, AbstractEnvironment):
+        return [
+            f"{type(env).__name__} is not an environment of ours: derive it from "
+            "credo.environments.base.AbstractEnvironment, or AbstractSequenceTask for a "
+            "labelled sequence"
+        ]
+    stages: list[Callable[..., list[str]]] = [_spec, _reset_and_step, _repeatable, _episodes]
+    if isinstance(env, AbstractSequenceTask):
+        stages[1:1] = [_sequence, _sequences, _sequence_reward]
+    for stage in stages:
+        problems = stage(env)
+        if problems:
+            return list(dict.fromkeys(problems))
+    return []
+
+
+def _spec(env: AbstractEnvironment) -> list[str]:
+    problems = [
+        f"{name} is {getattr(env, name)!r}: it must be a Python int of at least 1"
+        for name in ("obs_size", "action_size", "max_steps", "agents")
+        if not (name == "agents" and env.agents is None)
+        and not (isinstance(getattr(env, name), int) and getattr(env, name) >= 1)
+    ]
+    names = env.signals
+    if not (isinstance(names, tuple) and names and all(isinstance(name, str) for name in names)):
+        problems.append(f"signals is {names!r}: it must be a tuple of one or more names")
+    elif len(set(names)) < len(names):
+        problems.append(f"signals is {names!r}: a name occurs twice; give each reward its own")
+    low, high = env.obs_range
+    if not low < high:
+        problems.append(f"obs_range is {env.obs_range}: it must be (least, largest)")
+    return problems
+
+
+def _reset_and_step(env: AbstractEnvironment) -> list[str]:
+    state, first = env.reset(key=jax.random.key(0))
+    problems = _time_step(env, "reset", first)
+    if problems:
+        return problems
+    for name, reward in first.rewards.items():
+        if np.any(np.asarray(reward) != 0):
+            problems.append(
+                f"reset: reward {name!r} is {np.asarray(reward)}, but nothing was done yet: "
+                "return zeros and pay at the first step"
+            )
+    if bool(first.terminated) or bool(first.truncated):
+        problems.append("reset: the episode has already ended: start one that can be played")
+    next_state, second = env.step(state, _action(env, 0), key=jax.random.key(1))
+    problems += _time_step(env, "step", second)
+    return problems or _same_structure((state, first), (next_state, second))
+
+
+def _time_step(env: AbstractEnvironment, where: str, time_step: TimeStep) -> list[str]:
+    if not isinstance(time_step, TimeStep):
+        return [f"{where}: the second result is {type(time_step).__name__}: return a TimeStep"]
+    team = () if env.agents is None else (env.agents,)
+    problems = _array(f"{where}: obs", time_step.obs, (*team, env.obs_size), np.float32)
+    given, named = set(time_step.rewards), set(env.signals)
+    if given != named:
+        problems.append(
+            f"{where}: rewards are {sorted(given)} but signals names {sorted(named)}: return "
+            "exactly those, every time"
+        )
+    for name, reward in time_step.rewards.items():
+        shape = team if np.ndim(reward) else ()
+        problems += _array(f"{where}: reward {name!r}", reward, shape, np.float32)
+    for name in ("terminated", "truncated"):
+        problems += _array(f"{where}: {name}", getattr(time_step, name), (), np.bool_)
+    if time_step.active is not None:
+        if not team:
+            problems.append(f"{where}: active is for teams: leave it None, or set agents")
+        problems += _array(f"{where}: active", time_step.active, team, np.bool_)
+    return problems
+
+
+def _array(what: str, x: Array, shape: tuple[int, ...], dtype: type) -> list[str]:
+    """Problems of one value that should be a finite array of this shape and dtype."""
+    name = np.dtype(dtype).name
+    if not eqx.is_array(x):
+        return [f"{what} is a {type(x).__name__}: return a JAX array, {name} of shape {shape}"]
+    problems = []
+    if x.shape != shape:
+        problems.append(f"{what} has shape {x.shape}: it must be {shape}")
+    if x.dtype != dtype:
+        problems.append(f"{what} is {x.dtype}: it must be {name}; use .astype(jnp.{name})")
+    elif not bool(jnp.all(jnp.isfinite(x))):
+        problems.append(f"{what} has NaN or inf: guard the division, root or logarithm it is from")
+    return problems
+
+
+def _same_structure(reset: PyTree, step: PyTree) -> list[str]:
+    """A loop carries state and time step, so both must keep their form."""
+    if jax.tree.structure(reset) != jax.tree.structure(step):
+        return [
+            "reset and step return different structures: give state and time step the same "
+            f"fields in both (reset {jax.tree.structure(reset)}, step {jax.tree.structure(step)})"
+        ]
+    pairs = zip(jax.tree.leaves_with_path(reset), jax.tree.leaves(step), strict=True)
+    return [
+        f"{('state', 'time step')[path[0].idx]}{jax.tree_util.keystr(path[1:])} is "
+        f"{_form(a)} after reset and {_form(b)} after step: return one form"
+        for (path, a), b in pairs
+        if _form(a) != _form(b)
+    ]
+
+
+def _form(x) -> str:
+    return f"{jnp.result_type(x)}{list(np.shape(x))}"
+
+
+def _repeatable(env: AbstractEnvironment) -> list[str]:
+    """Without `jit`: a compiled program would repeat what the host drew while tracing."""
+
+    def play() -> PyTree:
+        state, first = env.reset(key=jax.random.key(0))
+        seen = [(state, first)]
+        for t in range(min(3, env.max_steps)):
+            state, time_step = env.step(state, _action(env, t), key=jax.random.key(t))
+            seen.append((state, time_step))
+            if time_step.terminated or time_step.truncated:
+                break
+        return seen
+
+    if _equal(play(), play()):
+        return []
+    return [
+        "the same key gave two different episodes: draw everything from `key` with jax.random, "
+        "and keep no state outside the one that reset and step return"
+    ]
+
+
+def _episodes(env: AbstractEnvironment) -> list[str]:
+    played = jax.jit(jax.vmap(lambda key: _play(env, key)))(
+        jax.random.split(jax.random.key(0), KEYS)
+    )
+    steps, ended, faults, digest = (np.asarray(x) for x in played)
+    told = (
+        "obs has NaN or inf at step {}: keep it finite for every action in [-1, 1]",
+        f"obs leaves obs_range {env.obs_range} at step {{}}: widen obs_range, or clip",
+        "a reward has NaN or inf at step {}: keep it finite for every action in [-1, 1]",
+    )
+    problems = [
+        "step: " + line.format(at)
+        for line, at in zip(told, faults.min(axis=0), strict=True)
+        if at < _never(env)
+    ]
+    if not ended.all():
+        problems.append(
+            f"an episode had not ended after {steps.max()} steps, and max_steps is "
+            f"{env.max_steps}: set truncated when the clock runs out"
+        )
+    elif steps.max() > env.max_steps:
+        problems.append(
+            f"an episode took {steps.max()} steps and max_steps is {env.max_steps}: set "
+            "truncated there, or raise max_steps"
+        )
+    if not problems and (digest == digest[:1]).all():
+        problems.append(
+            f"{KEYS} different keys gave the same episode: draw the start, or the noise of the "
+            "steps, from `key`"
+        )
+    return problems
+
+
+def _play(env: AbstractEnvironment, key: PRNGKeyArray):
+    """One episode of random actions that do not depend on the key.
+
+    **Returns:** steps, whether it ended, the first step of each fault, and numbers that two
+    different episodes do not share.
+    """
+    reset_key, step_key = jax.random.split(key)
+
+    def ongoing(loop):
+        _, time_step, step, *_ = loop
+        return ~(time_step.terminated | time_step.truncated) & (step < 2 * env.max_steps)
+
+    def advance(loop):
+        state, _, step, faults, digest = loop
+        action, key = _action(env, step), jax.random.fold_in(step_key, step)
+        state, time_step = env.step(state, action, key=key)
+        found, numbers = _look(env, time_step, step + 1)
+        return state, time_step, step + 1, jnp.minimum(faults, found), digest + numbers
+
+    state, first = env.reset(key=reset_key)
+    start = (state, first, jnp.int32(0), *_look(env, first, jnp.int32(0)))
+    _, last, step, faults, digest = jax.lax.while_loop(ongoing, advance, start)
+    ended = last.terminated | last.truncated
+    return step, ended, faults, jnp.append(digest, step.astype(jnp.float32))
+
+
+def _look(env: AbstractEnvironment, time_step: TimeStep, step: Array) -> tuple[Array, Array]:
+    """`step` where a fault shows now, else never; and the content weighted by its time."""
+    obs = jnp.ravel(time_step.obs)
+    rewards = jnp.concatenate([jnp.ravel(x) for x in time_step.rewards.values()])
+    low, high = env.obs_range
+    faults = jnp.stack(
+        [
+            ~jnp.all(jnp.isfinite(obs)),
+            jnp.any((obs < low) | (obs > high)),
+            ~jnp.all(jnp.isfinite(rewards)),
+        ]
+    )
+    content = jnp.nan_to_num(jnp.concatenate([obs, rewards]))
+    weight = jnp.cos(step.astype(jnp.float32) + 1.0)
+    return jnp.where(faults, step, _never(env)), content * weight
+
+
+def _never(env: AbstractEnvironment) -> int:
+    """Later than any step that is played."""
+    return 3 * env.max_steps
+
+
+def _action(env: AbstractEnvironment, step) -> Array:
+    """A random action; a third of its entries lie on the bounds."""
+    shape = (env.action_size,) if env.agents is None else (env.agents, env.action_size)
+    key = jax.random.fold_in(jax.random.key(1), step)
+    return jnp.clip(jax.random.uniform(key, shape, minval=-1.5, maxval=1.5), -1.0, 1.0)
+
+
+def _sequence(task: AbstractSequenceTask) -> list[str]:
+    """Form of one sequence, drawn without `jit` so that randomness of the host shows."""
+    sequence, again = (task.sample(key=jax.random.key(0)) for _ in range(2))
+    if not isinstance(sequence, Sequence):
+        return [f"sample: the result is {type(sequence).__name__}: return a Sequence"]
+    time = (task.max_steps,)
+    problems = [
+        *_array("sample: inputs", sequence.inputs, (*time, task.obs_size), np.float32),
+        *_array("sample: targets", sequence.targets, time, np.float32),
+        *_array("sample: scored", sequence.scored, time, np.bool_),
+        *_array("sample: length", sequence.length, (), np.int32),
+    ]
+    if not problems and not _equal(sequence, again):
+        problems.append(
+            "sample: the same key gave two different sequences: draw everything from `key` with "
+            "jax.random"
+        )
+    return problems
+
+
+def _sequences(task: AbstractSequenceTask) -> list[str]:
+    """Content of many sequences."""
+    keys = jax.random.split(jax.random.key(0), KEYS)
+    drawn = jax.jit(jax.vmap(lambda key: task.sample(key=key)))(keys)
+    lengths, scored = np.asarray(drawn.length), np.asarray(drawn.scored)
+    padding = np.arange(task.max_steps) >= lengths[:, None]
+    problems = []
+    if lengths.min() < 1 or lengths.max() > task.max_steps:
+        problems.append(
+            f"sample: lengths are {lengths.min()}..{lengths.max()} and max_steps is "
+            f"{task.max_steps}: every length must lie in 1..max_steps"
+        )
+    if np.any(scored & padding):
+        problems.append(
+            "sample: a step at or beyond `length` is scored: padding must not count; clear "
+            "scored there or correct length"
+        )
+    if not np.all(np.any(scored & ~padding, axis=1)):
+        problems.append(
+            "sample: a sequence has no scored step before its `length`: without one every answer "
+            "is a success"
+        )
+    for name in ("inputs", "targets"):
+        if not np.all(np.isfinite(getattr(drawn, name))):
+            problems.append(f"sample: {name} has NaN or inf for some key: keep them finite")
+    if not problems and _equal(
+        drawn, jax.tree.map(lambda x: np.broadcast_to(x[:1], x.shape), drawn)
+    ):
+        problems.append(f"sample: {KEYS} different keys gave the same sequence: draw it from `key`")
+    return problems
+
+
+def _sequence_reward(task: AbstractSequenceTask) -> list[str]:
+    """`reward` acts elementwise: the fast path calls it with whole populations."""
+    answer, target = jnp.meshgrid(jnp.array([-1.0, 0.0, 0.5, 1.0]), jnp.array([-1.0, 0.0, 1.0]))
+    scored, perfect = jnp.ones((3, 4), bool), jnp.zeros((3, 4), bool)
+    reward = task.reward(answer, target, scored, perfect)
+    problems = _array("reward: its value for answers of shape (3, 4)", reward, (3, 4), np.float32)
+    if not problems:
+        one = task.reward(answer[1, 2], target[1, 2], scored[1, 2], perfect[1, 2])
+        if not np.allclose(one, reward[1, 2]):
+            problems.append(
+                f"reward: one answer alone earns {one}, within a batch {reward[1, 2]}: work "
+                "elementwise, without sums over the batch"
+            )
+    return problems
+
+
+def _equal(a: PyTree, b: PyTree) -> bool:
+    """Whether two trees hold the same numbers."""
+
+    def numbers(x) -> np.ndarray:
+        is_key = eqx.is_array(x) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(x) if is_key else x)
+
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(np.array_equal(numbers(x), numbers(y), equal_nan=True) for x, y in pairs)

@@ -1,0 +1,154 @@
+"""Tasks with a known answer: an algorithm that fails one has the defect that its name says.
+
+They are for tests and for debugging one's own algorithm or network: each is learned in seconds,
+and the best possible return is written beside it.
+
+| probe | needs | best | without it |
+|---|---|---|---|
+| `Copy` | the observation reaches the action | 0 | -size·max_steps/3 (action 0) |
+| `Remember` | memory across `delay` steps | 1 | success ½ |
+| `Meet` | both agents of a team act | 1 (global) | 0 |
+"""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from ..types import Sequence, TimeStep
+from .base import AbstractEnvironment, AbstractSequenceTask
+
+
+class CopyState(eqx.Module):
+    obs: Float[Array, " size"]
+    step: Int[Array, ""]
+
+
+class Copy(AbstractEnvironment):
+    """Act as you see: the reward is minus the squared distance of action and observation.
+
+    Each observation is uniform in [-1, 1], independent of all before it and of the actions. The
+    clock ends the episode (truncated). Best return 0; the action 0 earns -size·max_steps/3 on
+    average.
+    """
+
+    signals: ClassVar[tuple[str, ...]] = ("reward",)
+    obs_range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
+
+    size: int = eqx.field(static=True, default=1)  # numbers to copy, at least 1
+    max_steps: int = eqx.field(static=True, default=10)  # length of every episode, at least 1
+
+    def __check_init__(self):
+        if self.size < 1 or self.max_steps < 1:
+            raise ValueError(
+                f"size is {self.size} and max_steps is {self.max_steps}: both must be at least 1"
+            )
+
+    @property
+    def obs_size(self) -> int:
+        return self.size
+
+    @property
+    def action_size(self) -> int:
+        return self.size
+
+    def reset(self, *, key: PRNGKeyArray) -> tuple[CopyState, TimeStep]:
+        return self._at(jnp.int32(0), jnp.float32(0.0), key)
+
+    def step(
+        self, state: CopyState, action: Float[Array, " size"], *, key: PRNGKeyArray
+    ) -> tuple[CopyState, TimeStep]:
+        return self._at(state.step + 1, -jnp.sum((action - state.obs) ** 2), key)
+
+    def _at(self, step, reward, key):
+        obs = jax.random.uniform(key, (self.size,), minval=-1.0, maxval=1.0)
+        truncated = step >= self.max_steps
+        return CopyState(obs, step), TimeStep(obs, {"reward": reward}, jnp.bool_(False), truncated)
+
+
+class Remember(AbstractSequenceTask):
+    """See one signal ±1, then `delay` zeros, and repeat the signal at the last of them.
+
+    The reward is answer·signal at that step and 0 before. Best return 1, success 1. The answer
+    of a policy without memory cannot depend on the signal: fitness 0, success ½ on average.
+    """
+
+    obs_range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
+
+    delay: int = eqx.field(static=True, default=5)  # steps the signal must be kept, at least 1
+
+    def __check_init__(self):
+        if self.delay < 1:
+            raise ValueError(f"delay is {self.delay}: it must be at least 1 step")
+
+    @property
+    def obs_size(self) -> int:
+        return 1
+
+    @property
+    def max_steps(self) -> int:
+        return self.delay + 1
+
+    def sample(self, *, key: PRNGKeyArray) -> Sequence:
+        signal = jax.random.rademacher(key, (), jnp.float32)
+        last = jnp.arange(self.max_steps) == self.delay
+        inputs = jnp.zeros((self.max_steps, 1)).at[0, 0].set(signal)
+        return Sequence(inputs, jnp.where(last, signal, 0.0), last, jnp.int32(self.max_steps))
+
+    def reward(
+        self,
+        answer: Float[Array, "*b"],
+        target: Float[Array, "*b"],
+        scored: Bool[Array, "*b"],
+        perfect: Bool[Array, "*b"],
+    ) -> Float[Array, "*b"]:
+        return jnp.where(scored, answer * target, 0.0)
+
+
+class MeetState(eqx.Module):
+    position: Float[Array, " agents"]
+    step: Int[Array, ""]
+
+
+class Meet(AbstractEnvironment):
+    """Two agents on a line walk towards each other; neither can cover the way alone.
+
+    Agent 0 starts at -1..-0.7 and agent 1 at 0.7..1; a full action moves an agent by 0.2. At a
+    distance of 0.2 or less they have met and the episode is terminated; after 5 steps it is
+    truncated. Each agent sees [its position, the way to the other] in the same units.
+
+    Signals: `global`, shared: 1 on meeting; `local` `[2]`: how far each agent's own move led
+    towards the other, at most 0.2 a step. Two agents at full speed meet in 4 or 5 steps: the best
+    `global` return is 1 from every start. If one of them stands still it is 0 from every start.
+    """
+
+    agents: ClassVar[int | None] = 2
+    obs_size: ClassVar[int] = 2
+    action_size: ClassVar[int] = 1
+    max_steps: ClassVar[int] = 5
+    signals: ClassVar[tuple[str, ...]] = ("global", "local")
+    obs_range: ClassVar[tuple[float, float]] = (-4.0, 4.0)
+
+    def reset(self, *, key: PRNGKeyArray) -> tuple[MeetState, TimeStep]:
+        start = jax.random.uniform(key, (2,), minval=0.7, maxval=1.0)
+        state = MeetState(start * jnp.array([-1.0, 1.0]), jnp.int32(0))
+        return state, self._time_step(state, jnp.zeros(2), jnp.bool_(False))
+
+    def step(
+        self, state: MeetState, action: Float[Array, "agents act"], *, key: PRNGKeyArray
+    ) -> tuple[MeetState, TimeStep]:
+        move = 0.2 * jnp.clip(action[:, 0], -1.0, 1.0)
+        local = move * jnp.sign(state.position[::-1] - state.position)
+        state = MeetState(state.position + move, state.step + 1)
+        met = jnp.abs(state.position[0] - state.position[1]) <= 0.2
+        return state, self._time_step(state, local, met)
+
+    def _time_step(
+        self, state: MeetState, local: Float[Array, " agents"], met: Bool[Array, ""]
+    ) -> TimeStep:
+        obs = jnp.stack([state.position, state.position[::-1] - state.position], axis=1)
+        rewards = {"global": met.astype(jnp.float32), "local": local}
+        truncated = ~met & (state.step >= self.max_steps)
+        return TimeStep(obs, rewards, met, truncated, jnp.ones(2, bool))

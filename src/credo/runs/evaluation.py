@@ -1,0 +1,41 @@
+"""What `credo evaluate` prints: a champion on fresh episodes."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from .. import tree
+from ..analysis import counting, floors
+from ..environments.sequence_classification import SequenceClassification
+from ..rollout import evaluate
+from .loop import Run
+
+STREAMED = 1000  # deeper sequences are streamed: memory does not grow with their length
+
+
+def describe(run: Run, task: Any, episodes: int, seed: int) -> Iterator[str]:
+    """Lines about the champion on `task`, which may differ from the one it was trained on."""
+    policies = tree.stack(run.champion)
+    key = jax.random.fold_in(jax.random.key(seed), 1_000_003)  # not a key of any training run
+    if isinstance(task, SequenceClassification) and task.depth > STREAMED:
+        streams = min(episodes, 20)
+        lengths = counting.longest_correct(
+            policies, task.depth, streams, min_gap=task.min_gap, max_gap=task.max_gap,
+            ties=task.ties, key=key,
+        )[0]  # fmt: skip
+        yield f"{run.path}: {streams} streams of {task.depth:,} signals"
+        yield f"  success          {np.mean(np.asarray(lengths) >= task.depth):.3f}"
+        yield f"  signals right    median {int(np.median(lengths)):,}, worst {int(lengths.min()):,}"
+        return
+    evaluation = evaluate(task, policies, episodes, key=key)
+    yield f"{run.path}: {episodes} fresh episodes"
+    for name, returns in evaluation.returns.items():
+        values = np.asarray(returns[0], np.float64)
+        error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
+        yield f"  {name:<16} {values.mean():.4g} ± {error:.2g}"
+    yield f"  steps            {np.mean(evaluation.steps):.1f}"
+    if floors.known(task):
+        name, value = floors.floor(task)
+        yield f"  floor            {value:.3g} ({name}), ceiling {floors.CEILING:.3g}"

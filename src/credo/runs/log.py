@@ -1,0 +1,93 @@
+"""Metrics on disk: `metrics.csv` (only what a rerun repeats bit for bit), `timing.csv` (the clock)
+and TensorBoard events."""
+
+import csv
+import os
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+
+
+class Log:
+    """Appends rows. A run that is resumed is cut back to its checkpoint, so that generations are
+    strictly increasing and equal to those of an undisturbed run."""
+
+    def __init__(self, directory: pathlib.Path, generation: int, *, tensorboard: bool = True):
+        """`generation`: how many are done; rows of later ones are removed."""
+        self.directory = directory
+        for name in ("metrics.csv", "timing.csv"):
+            _cut(directory / name, generation)
+        self.events = None
+        if tensorboard:
+            from tensorboardX import SummaryWriter  # half a second that a closed log need not pay
+
+            self.events = SummaryWriter(
+                str(directory / "tensorboard"), purge_step=generation + 1, flush_secs=10
+            )
+
+    def append(self, rows: Sequence[dict[str, float | int]], seconds: float, elapsed: float):
+        """`rows`: one per generation, in order; `seconds` they took together; `elapsed` so far."""
+        _append(self.directory / "metrics.csv", rows)
+        last = {"generation": rows[-1]["generation"], "seconds": elapsed}
+        last["generations_per_second"] = len(rows) / max(seconds, 1e-9)
+        _append(self.directory / "timing.csv", [last])
+        if self.events is not None:
+            for row in rows:
+                for name, value in row.items():
+                    if name != "generation":
+                        self.events.add_scalar(name, value, int(row["generation"]))
+
+    def close(self):
+        if self.events is not None:
+            self.events.close()
+
+
+def read(path: pathlib.Path) -> dict[str, np.ndarray]:
+    """The columns of a metrics file; empty if there is none."""
+    if not path.exists():
+        return {}
+    with path.open(newline="") as file:
+        rows = list(csv.reader(file))
+    if not rows:
+        return {}
+    columns = zip(*rows[1:], strict=True) if rows[1:] else ([] for _ in rows[0])
+    return {
+        name: np.array([float(x) for x in column])
+        for name, column in zip(rows[0], columns, strict=True)
+    }
+
+
+def _text(value: float | int) -> str:
+    # Nine digits are enough for a float32 to come back as itself.
+    return str(int(value)) if isinstance(value, int | np.integer) else f"{float(value):.9g}"
+
+
+def _append(path: pathlib.Path, rows: Sequence[dict[str, float | int]]):
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        if new:
+            writer.writerow(rows[0])
+        writer.writerows([_text(value) for value in row.values()] for row in rows)
+
+
+def _cut(path: pathlib.Path, generation: int):
+    """Keep the header and the rows up to `generation`; a half-written line goes too."""
+    if not path.exists():
+        return
+    lines = path.read_text().splitlines(keepends=True)
+    kept = [
+        line
+        for line in lines[1:]
+        if line.endswith("\n")
+        and line.count(",") == lines[0].count(",")
+        and int(line.split(",")[0]) <= generation
+    ]
+    draft = path.with_name(f".{path.name}.draft")
+    draft.write_text("".join([lines[0], *kept]) if kept else "")
+    if kept:
+        os.replace(draft, path)
+    else:
+        draft.unlink()
+        path.unlink()

@@ -1,0 +1,15 @@
+import os
+
+# Tests run one worker per core: one thread each, and programs compiled for speed of compiling.
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0"
+)
+
+import jax
+
+from credo import compilation
+
+compilation.enable_cache()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")

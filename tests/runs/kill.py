@@ -1,0 +1,109 @@
+"""Kill a run at random moments, resume it each time, and compare it with one left alone.
+
+    python tests/runs/kill.py --kills 20
+
+Half of the kills fall anywhere in the life of a process (imports, the first checkpoint,
+compiling), half while it trains and writes. What must agree, byte for byte: metrics, champion,
+config and the last checkpoint.
+"""
+
+import argparse
+import pathlib
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+TRAIN = [
+    "train", "neuroevolution", "sequence-classification", "--depth", "3", "--min-gap", "1",
+    "--max-gap", "3", "--population-size", "20", "--episodes", "5", "--network.hidden", "3",
+]  # fmt: skip
+
+
+def start(run: pathlib.Path, generations: int) -> subprocess.Popen:
+    """Resume the run if there is one to resume, else train."""
+    if (run / "config.json").exists():
+        arguments = ["resume", str(run)]
+    else:
+        arguments = [*TRAIN, "--generations", str(generations), "--path", str(run)]
+    return subprocess.Popen(
+        [sys.executable, "-m", "credo.cli", *arguments, "--checkpoint-every", "0.05"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def finish(run: pathlib.Path, generations: int) -> None:
+    process = start(run, generations)
+    output, _ = process.communicate()
+    if process.returncode != 0:
+        raise SystemExit(f"credo failed with exit code {process.returncode}:\n{output}")
+
+
+def rows(run: pathlib.Path) -> int:
+    path = run / "timing.csv"
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def kill_once(run: pathlib.Path, generations: int, life: float, rng: random.Random) -> str:
+    """Start, wait for a random moment, SIGKILL. Says where the run then was."""
+    process = start(run, generations)
+    before, began = rows(run), time.monotonic()
+    if rng.random() < 0.5:
+        time.sleep(rng.uniform(0.0, life))
+    else:
+        while process.poll() is None and rows(run) <= before and time.monotonic() - began < 60:
+            time.sleep(0.002)
+        time.sleep(rng.uniform(0.0, 0.5))
+    ended = process.poll()
+    process.send_signal(signal.SIGKILL)
+    output, _ = process.communicate()
+    if ended not in (None, 0):
+        raise SystemExit(f"credo failed with exit code {ended}:\n{output}")
+    saved = sorted(p.name for p in (run / "checkpoints").glob("[0-9]*"))
+    return f"after {time.monotonic() - began:.2f} s, newest checkpoint {saved[-1:] or 'none'}"
+
+
+def different(a: pathlib.Path, b: pathlib.Path) -> list[str]:
+    """Files that are not the same bytes in both runs."""
+    newest = sorted(p.name for p in (a / "checkpoints").glob("[0-9]*"))[-1]
+    names = ["metrics.csv", "champion.safetensors", "config.json"]
+    names += [f"checkpoints/{newest}/{p.name}" for p in (a / "checkpoints" / newest).iterdir()]
+    return [
+        name
+        for name in names
+        if not (b / name).exists() or (a / name).read_bytes() != (b / name).read_bytes()
+    ]
+
+
+def compare(folder: pathlib.Path, kills: int, generations: int, seed: int = 0) -> list[str]:
+    """The files in which a run killed `kills` times differs from one left alone."""
+    began = time.monotonic()
+    finish(folder / "alone", generations)
+    life, rng = time.monotonic() - began, random.Random(seed)
+    for i in range(kills):
+        where = kill_once(folder / "killed", generations, life, rng)
+        print(f"kill {i + 1:2d} {where}", flush=True)
+    finish(folder / "killed", generations)
+    return different(folder / "alone", folder / "killed")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--generations", type=int, default=20_000)
+    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        found = compare(
+            pathlib.Path(folder), arguments.kills, arguments.generations, arguments.seed
+        )
+    print(f"differing files: {', '.join(found) or 'none'}")
+    raise SystemExit(bool(found))
+
+
+if __name__ == "__main__":
+    main()
