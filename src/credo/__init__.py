@@ -1,12 +1,12 @@
 """Credo: credit assignment by evolution and gradient.
 
-    import credo
+import credo
 
-    task = credo.SequenceClassification(depth=5)
-    algorithm = credo.Neuroevolution.ours(task, credo.MMU(hidden=5))
-    run = credo.train(algorithm, generations=300)
-    policy = run.policy()
-    action = policy(observation)
+task = credo.SequenceClassification(depth=5)
+algorithm = credo.Neuroevolution.ours(task, credo.MMU(hidden=5))
+run = credo.train(algorithm, generations=300)
+policy = run.policy()
+action = policy(observation)
 """
 
 import importlib

@@ -74,7 +74,9 @@ def main(argv: list[str] | None = None) -> None:
     if command not in COMMANDS:
         fail(f"no command {command!r}", command, COMMANDS)
     rest = [_plain_integer(token) for token in rest]
-    warnings.showwarning = lambda message, *_args, **_kw: print(f"warning: {message}", file=sys.stderr)
+    warnings.showwarning = lambda message, *_args, **_kw: print(
+        f"warning: {message}", file=sys.stderr
+    )
     # Environments of users lie where they work.
     sys.path.insert(0, os.getcwd())
     globals()[f"_{command}"](rest)
@@ -421,7 +423,7 @@ def _with_plain_task(algorithm: Any) -> Any:
     """The algorithm as a class whose `env` flags have no prefix."""
     import tyro
 
-    cls = type(algorithm)
+    cls: Any = type(algorithm)
     plain = Annotated[type(algorithm.env), tyro.conf.arg(name="")]
     body = {
         "__annotations__": {"env": plain},

@@ -1,11 +1,14 @@
 """A population is a pytree whose array leaves carry a leading axis `[pop]`."""
 
 import itertools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 
 def size(population: PyTree) -> int:
@@ -57,26 +60,41 @@ def where(pred: Bool[Array, ""], a: PyTree, b: PyTree) -> PyTree:
     return jax.tree.map(lambda x, y: jnp.where(pred, x, y) if eqx.is_array(x) else x, a, b)
 
 
-def uniform_like(tree: PyTree, *, key: PRNGKeyArray) -> PyTree:
-    """Uniform [0, 1) numbers of the shape of every inexact array leaf; leaves share none."""
-    return _draw_like(jax.random.uniform, tree, key)
+class Layout(eqx.Module):
+    """Where the entries of a flattened genome come from: static numbers, one per entry."""
+
+    leaf: Int[np.ndarray, " entries"]  # which leaf
+    row: Int[np.ndarray, " entries"]  # which row of all rows; a vector has one entry per row
+    place: Int[np.ndarray, " entries"]  # position within its leaf
+    sizes: Int[np.ndarray, " leaves"]
+
+    @property
+    def rows(self) -> int:
+        return int(self.row[-1]) + 1
 
 
-def normal_like(tree: PyTree, *, key: PRNGKeyArray) -> PyTree:
-    """Standard normal numbers of the shape of every inexact array leaf; leaves share none."""
-    return _draw_like(jax.random.normal, tree, key)
+def ravel(
+    genome: PyTree,
+) -> tuple[Float[Array, " entries"], Callable[[Array], PyTree], Layout]:
+    """All inexact array leaves of one genome as a vector, the way back, and the layout.
 
-
-def _draw_like(sampler, tree, key):
-    # One draw cut into leaves: a draw per leaf inlines the generator per leaf, and an MMU's
-    # mutation then takes minutes to compile.
-    leaves, treedef = jax.tree.flatten(eqx.filter(tree, eqx.is_inexact_array))
-    numbers = sampler(key, (sum(leaf.size for leaf in leaves),))
-    cuts = list(itertools.accumulate((leaf.size for leaf in leaves), initial=0))
-    return jax.tree.unflatten(
-        treedef,
-        [
-            numbers[i:j].reshape(leaf.shape).astype(leaf.dtype)
-            for leaf, i, j in zip(leaves, cuts[:-1], cuts[1:], strict=True)
-        ],
+    Operators work on the vector: leaf by leaf they would be one program per matrix, and an MMU
+    has seventeen.
+    """
+    weights, rest = eqx.partition(genome, eqx.is_inexact_array)
+    vector, unravel = jax.flatten_util.ravel_pytree(weights)
+    leaves = [np.zeros(leaf.shape) for leaf in jax.tree.leaves(weights)]
+    rows = list(itertools.accumulate((len(np.atleast_1d(x)) for x in leaves), initial=0))
+    layout = Layout(
+        leaf=np.concatenate([np.full(x.size, i) for i, x in enumerate(leaves)]),
+        row=np.concatenate(
+            [
+                first + np.repeat(np.arange(count), x.size // count)
+                for first, x in zip(rows, leaves, strict=False)
+                for count in (len(np.atleast_1d(x)),)
+            ]
+        ),
+        place=np.concatenate([np.arange(x.size) for x in leaves]),
+        sizes=np.array([x.size for x in leaves]),
     )
+    return vector, lambda vector: eqx.combine(unravel(vector), rest), layout

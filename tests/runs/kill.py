@@ -17,9 +17,22 @@ import tempfile
 import time
 
 TRAIN = [
-    "train", "neuroevolution", "sequence-classification", "--depth", "3", "--min-gap", "1",
-    "--max-gap", "3", "--population-size", "20", "--episodes", "5", "--network.hidden", "3",
-]  # fmt: skip
+    "train",
+    "neuroevolution",
+    "sequence-classification",
+    "--depth",
+    "3",
+    "--min-gap",
+    "1",
+    "--max-gap",
+    "3",
+    "--population-size",
+    "20",
+    "--episodes",
+    "5",
+    "--network.hidden",
+    "3",
+]
 
 
 def start(run: pathlib.Path, generations: int) -> subprocess.Popen:

@@ -75,8 +75,9 @@ class Stream(eqx.Module):
     """How many signals of that sign the cell counted, from the first on, before it once did not.
 
     A cell counts a signal if signal and distractors after it move the cell by at least
-    `minimum`, in the direction in which the first signal of that sign moved it; and if not the
-    distractors do it: what the last one moved, times their number, is less than half of it."""
+    `minimum`, in the direction in which the first signal of that sign moved it; and if it is not
+    the distractors that do it: what the last one moved, times their number, is under half of
+    that."""
 
 
 class _Loop(eqx.Module):
@@ -129,20 +130,8 @@ def stream(
         return unfinished & jnp.any(loop.correct == loop.fed) if until_mistake else unfinished
 
     def period(loop: _Loop) -> _Loop:
-        """A signal and the distractors after it."""
         signal, zeros = jnp.tile(signals(loop.fed), lanes[0]), gaps(loop.fed)
-        answer, carry = packed(signal[None], loop.carry)
-        memory = memory_of(carry)
-
-        def distract(_, carries):
-            carry, _ = carries
-            return packed(jnp.zeros_like(signal)[None], carry)[1], memory_of(carry)
-
-        carry, before_last = jax.lax.fori_loop(0, zeros, distract, (carry, memory))
-        net = memory_of(carry) - memory_of(loop.carry)
-        drift = (memory_of(carry) - before_last) * zeros.astype(jnp.float32)
-        moved = (jnp.abs(net) >= minimum) & (jnp.abs(drift) < 0.5 * jnp.abs(net))
-        return _tally(loop, signal, answer[0], carry, memory, jnp.where(moved, net, 0.0), ties)
+        return _period(packed, loop, signal, zeros, minimum, ties)
 
     def advance(loop: _Loop, stop):
         loop = jax.lax.while_loop(lambda loop: ongoing(loop, stop), period, loop)
@@ -171,6 +160,22 @@ def _start(packed: PyTree, lanes: tuple[int, int]) -> _Loop:
         direction=jnp.zeros((2, *memory.shape)),
         counted=jnp.zeros((2, *memory.shape), jnp.int32),
     )
+
+
+def _period(packed: PyTree, loop: _Loop, signal, zeros, minimum, ties) -> _Loop:
+    """A signal and the zeros after it: the only place where the policies step."""
+    answer, carry = packed(signal[None], loop.carry)
+    memory = memory_of(carry)
+
+    def distract(_, carries):
+        carry, _ = carries
+        return packed(jnp.zeros_like(signal)[None], carry)[1], memory_of(carry)
+
+    carry, before_last = jax.lax.fori_loop(0, zeros, distract, (carry, memory))
+    net = memory_of(carry) - memory_of(loop.carry)
+    drift = (memory_of(carry) - before_last) * zeros.astype(jnp.float32)
+    moved = (jnp.abs(net) >= minimum) & (jnp.abs(drift) < 0.5 * jnp.abs(net))
+    return _tally(loop, signal, answer[0], carry, memory, jnp.where(moved, net, 0.0), ties)
 
 
 def _tally(loop: _Loop, signal, answer, carry, memory, move, ties) -> _Loop:

@@ -55,6 +55,11 @@ def recall_floors(depth: int) -> dict[str, float]:
     return {name: count / 2**depth for name, count in plans.items()}
 
 
+def known(task: object) -> bool:
+    """Whether `floor` has an answer for this task."""
+    return isinstance(task, SequenceClassification | SequenceRecall)
+
+
 def floor(task: AbstractSequenceTask) -> tuple[str, float]:
     """The best trivial policy on `task`: its name and its exact success."""
     if isinstance(task, SequenceClassification):

@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,15 +16,22 @@ class AbstractEnvironment(eqx.Module):
 
     No automatic reset and no batch axis: rollouts decide when to stop, `jax.vmap` decides how
     many. Observations are finite float32; actions lie in [-1, 1]. For a team both have a leading
-    agent axis and `agents` says how many.
+    agent axis and `agents` says how many. The attributes below are class variables, fields with
+    a default, or properties.
     """
 
-    obs_size: eqx.AbstractVar[int]
-    action_size: eqx.AbstractVar[int]
-    max_steps: eqx.AbstractVar[int]  # no episode is longer
-    signals: eqx.AbstractVar[tuple[str, ...]]
-    """Names of the rewards. The first is what training maximises and the last is what is
-    reported, unless an algorithm says otherwise."""
+    if TYPE_CHECKING:  # a type checker would take an AbstractVar for a field
+        obs_size: ClassVar[int]
+        action_size: ClassVar[int]
+        max_steps: ClassVar[int]
+        signals: ClassVar[tuple[str, ...]]
+    else:
+        obs_size: eqx.AbstractVar[int]
+        action_size: eqx.AbstractVar[int]
+        max_steps: eqx.AbstractVar[int]  # no episode is longer
+        signals: eqx.AbstractVar[tuple[str, ...]]
+        """Names of the rewards. The first is what training maximises and the last is what is
+        reported, unless an algorithm says otherwise."""
     agents: ClassVar[int | None] = None
     obs_range: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
     """The least and the largest number in an observation."""

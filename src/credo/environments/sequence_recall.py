@@ -45,7 +45,7 @@ class SequenceRecall(AbstractSequenceTask):
             )
 
     @property
-    def obs_range(self) -> tuple[float, float]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def obs_range(self) -> tuple[float, float]:
         return -1.0, self.max_corridor / (self.unit or self.max_corridor)
 
     @property

@@ -32,15 +32,12 @@ class MaskedCrossover(AbstractCrossover):
             raise ValueError(f"part is {self.part!r}: it must be 'matrix', 'row' or 'entry'")
 
     def __call__(self, a: PyTree, b: PyTree, *, key: PRNGKeyArray) -> PyTree:
-        mine, rest = eqx.partition(a, eqx.is_inexact_array)
-        yours = eqx.filter(b, eqx.is_inexact_array)
-
-        def cross(a, b, u):
-            if self.part == "matrix":
-                u = u.reshape(-1)[:1].reshape((1,) * a.ndim)
-            elif self.part == "row":
-                u = u.reshape(u.shape[0], -1)[:, 0].reshape(-1, *(1,) * (a.ndim - 1))
-            return jnp.where(u < self.probability, b, a)
-
-        uniform = tree.uniform_like(mine, key=key)
-        return eqx.combine(jax.tree.map(cross, mine, yours, uniform), rest)
+        mine, unravel, layout = tree.ravel(a)
+        yours, _, _ = tree.ravel(b)
+        part, parts = {
+            "matrix": (layout.leaf, len(layout.sizes)),
+            "row": (layout.row, layout.rows),
+            "entry": (slice(None), len(layout.leaf)),
+        }[self.part]
+        from_b = jax.random.bernoulli(key, self.probability, (parts,))
+        return unravel(jnp.where(from_b[part], yours, mine))

@@ -18,7 +18,5 @@ class Extinction(eqx.Module):
         """`population` and `fresh` `[pop, ...]`; spare the elites by not passing them."""
         event_key, member_key = jax.random.split(key)
         event = jax.random.bernoulli(event_key, self.probability)
-        dies = event & jax.random.bernoulli(
-            member_key, self.magnitude, (tree.size(population),)
-        )
+        dies = event & jax.random.bernoulli(member_key, self.magnitude, (tree.size(population),))
         return eqx.filter_vmap(tree.where)(dies, fresh, population)

@@ -51,34 +51,35 @@ class MatrixMutation(AbstractMutation):
             raise ValueError(f"gate is {self.gate!r}: it must be 'matrix' or 'genome'")
 
     def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
-        gate_key, chosen_key, kind_key, noise_key, floor_key = jax.random.split(key, 5)
-        weights, rest = eqx.partition(genome, eqx.is_inexact_array)
-        leaves, treedef = jax.tree.flatten(weights)
-        gates = jax.random.bernoulli(gate_key, self.probability, (len(leaves),))
-        share = jax.random.uniform(jax.random.fold_in(gate_key, 1), (len(leaves),))
-        draws = (
-            jax.tree.leaves(tree.uniform_like(weights, key=chosen_key)),
-            jax.tree.leaves(tree.uniform_like(weights, key=kind_key)),
-            jax.tree.leaves(tree.normal_like(weights, key=noise_key)),
-            jax.tree.leaves(tree.normal_like(weights, key=floor_key)),
-        )
-        mutants = []
-        for leaf, (w, u, kind, noise, extra) in enumerate(zip(leaves, *draws, strict=True)):
-            gate = gates[0 if self.gate == "genome" else leaf]
-            hit = gate & self.chosen(u, share[leaf])
-            mutants.append(jnp.where(hit, self.moved(w, kind, noise, extra), w))
-        return eqx.combine(jax.tree.unflatten(treedef, mutants), rest)
+        gate_key, hit_key, move_key = jax.random.split(key, 3)
+        w, unravel, layout = tree.ravel(genome)
+        gates = jax.random.bernoulli(gate_key, self.probability, layout.sizes.shape)
+        gate = gates[0] if self.gate == "genome" else gates[layout.leaf]
+        hit = gate & self.hits(layout, key=hit_key)
+        return unravel(jnp.where(hit, self.moved(w, key=move_key), w))
 
-    def chosen(self, u: Float[Array, "..."], share: Float[Array, ""]) -> Bool[Array, "..."]:
-        """Which entries of a matrix are hit, from uniform `u`."""
+    def hits(self, layout: tree.Layout, *, key: PRNGKeyArray) -> Bool[Array, " entries"]:
+        """Which entries a mutation hits in the matrices whose gate is open."""
+        entry_key, count_key, sure_key = jax.random.split(key, 3)
+        u = jax.random.uniform(entry_key, layout.leaf.shape)
         if not self.up_to_fraction:
             return u < self.fraction
-        most = jnp.ceil(self.fraction * u.size)
-        count = jnp.minimum(1.0 + jnp.floor(most * share), most)
-        return (u < count / u.size) | (u == jnp.min(u))
+        sizes = jnp.asarray(layout.sizes, jnp.float32)
+        most = jnp.ceil(self.fraction * sizes)
+        count = jnp.minimum(
+            1.0 + jnp.floor(most * jax.random.uniform(count_key, sizes.shape)), most
+        )
+        sure = jnp.floor(sizes * jax.random.uniform(sure_key, sizes.shape)).astype(jnp.int32)
+        # One entry for sure, the others by chance: `count` on average.
+        others = (count - 1.0) / jnp.maximum(sizes - 1.0, 1.0)
+        return (u < others[layout.leaf]) | (layout.place == sure[layout.leaf])
 
-    def moved(self, w, kind, noise, extra) -> Float[Array, "..."]:
-        """Every entry of a matrix as it is after a hit; `kind` uniform, the others normal."""
+    def moved(self, w: Float[Array, " n"], *, key: PRNGKeyArray) -> Float[Array, " n"]:
+        """Every weight as it is after a hit."""
+        kind_key, noise_key, extra_key = jax.random.split(key, 3)
+        kind = jax.random.uniform(kind_key, w.shape)
+        noise = jax.random.normal(noise_key, w.shape)
+        extra = jax.random.normal(extra_key, w.shape)
         is_super = kind < self.super_probability
         is_reset = ~is_super & (kind < self.super_probability + self.reset_probability)
         strength = jnp.where(is_super, self.super_strength, self.strength)
@@ -93,6 +94,5 @@ class GaussianMutation(AbstractMutation):
     std: float = 0.1
 
     def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
-        weights, rest = eqx.partition(genome, eqx.is_inexact_array)
-        noise = tree.normal_like(weights, key=key)
-        return eqx.combine(jax.tree.map(lambda w, n: w + self.std * n, weights, noise), rest)
+        w, unravel, _ = tree.ravel(genome)
+        return unravel(w + self.std * jax.random.normal(key, w.shape))

@@ -29,7 +29,9 @@ def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
     policies = chapter3.champions(cell)
     chosen, lengths = chapter3.best(policies)
     task, key = SequenceClassification(depth=21), jax.random.key(70_000)
-    found = [memory.pseudo_algorithm(tree.take(policies, i), task, key=key) for i in range(len(cell))]
+    found = [
+        memory.pseudo_algorithm(tree.take(policies, i), task, key=key) for i in range(len(cell))
+    ]
     return {
         "cell": name,
         "champion": chosen,
@@ -46,14 +48,25 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         Table(
             "Its cells: mean move per step",
             ["cell", "at +1", "at -1", "at a distractor", "role"],
-            [[f"M{r['cell'] + 1}", f"{r['plus']:+.3f}", f"{r['minus']:+.3f}",
-              f"{r['distractor']:+.2g}", r["role"]] for r in best],
+            [
+                [
+                    f"M{r['cell'] + 1}",
+                    f"{r['plus']:+.3f}",
+                    f"{r['minus']:+.3f}",
+                    f"{r['distractor']:+.2g}",
+                    r["role"],
+                ]
+                for r in best
+            ],
         ),
         Table(
             "Every run",
             ["run", "random signals right in a row", *(f"M{r['cell'] + 1}" for r in best)],
-            [[str(i), f"{length:.0f}", *(r["role"] for r in roles)]
-             for i, (roles, length) in enumerate(
-                 zip(measured["roles"], measured["signals right"], strict=True))],
+            [
+                [str(i), f"{length:.0f}", *(r["role"] for r in roles)]
+                for i, (roles, length) in enumerate(
+                    zip(measured["roles"], measured["signals right"], strict=True)
+                )
+            ],
         ),
-    ]  # fmt: skip
+    ]

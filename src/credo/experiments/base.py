@@ -71,8 +71,9 @@ def reproduce(
         cell if runs is None else eqx.tree_at(lambda c: c.runs, cell, runs)
         for cell in module.cells(budget)
     ]
-    folder = {cell.name: [work / budget / cell.name / str(s) for s in range(cell.runs)]
-              for cell in cells}  # fmt: skip
+    folder = {
+        cell.name: [work / budget / cell.name / str(s) for s in range(cell.runs)] for cell in cells
+    }
     executor.run(
         [
             executor.Job(path, cell.algorithm, cell.generations, seed)
@@ -112,8 +113,10 @@ def page(results: pathlib.Path) -> pathlib.Path:
     machine = record["machine"]
     facts = {
         "budget": record["budget"],
-        "runs": ", ".join(f"{n}: {c['runs']} × {c['generations']} generations"
-                          for n, c in record["cells"].items()),  # fmt: skip
+        "runs": ", ".join(
+            f"{name}: {cell['runs']} × {cell['generations']} generations"
+            for name, cell in record["cells"].items()
+        ),
         "machine": f"{machine['processor']}, {machine['device']}, {machine['system']}",
         "versions": ", ".join(f"{k} {v}" for k, v in machine["versions"].items()),
     }

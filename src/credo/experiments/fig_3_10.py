@@ -34,7 +34,9 @@ def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
 
 def sections(measured: dict[str, Any]) -> list[Any]:
     return [
-        *(fig_3_5a.figure(measured, variant, "steps per corridor", None)
-          for variant in fig_3_4a.variants(measured)),
+        *(
+            fig_3_5a.figure(measured, variant, "steps per corridor", None)
+            for variant in fig_3_4a.variants(measured)
+        ),
         fig_3_5a.table(measured, {}, "steps"),
-    ]  # fmt: skip
+    ]

@@ -67,7 +67,10 @@ def summary(measured: dict[str, Any], published: float | None = 0.876) -> Figure
     curves = []
     for variant in variants(measured):
         cell = of_variant(measured, variant)
-        runs = [[cell[d]["success"][i] for d in cell] for i in range(len(next(iter(cell.values()))["success"]))]
+        runs = [
+            [cell[d]["success"][i] for d in cell]
+            for i in range(len(next(iter(cell.values()))["success"]))
+        ]
         curves.append(Curve(variant, list(cell), runs))
     references = (Reference("published, 21-deep", published),) if published else ()
     return Figure(
@@ -115,8 +118,16 @@ def table(measured: dict[str, Any], given: dict[int, str] = GIVEN) -> Table:
         )
     return Table(
         "Success in percent, mean ± standard error over runs",
-        ["depth", "variant", "floor", "published", "ours", "median (range)", "ceiling",
-         "50 sequences, raw / smoothed"],
+        [
+            "depth",
+            "variant",
+            "floor",
+            "published",
+            "ours",
+            "median (range)",
+            "ceiling",
+            "50 sequences, raw / smoothed",
+        ],
         rows,
         caption="Floor: the best policy that remembers at most one signal, computed exactly.",
-    )  # fmt: skip
+    )

@@ -46,15 +46,15 @@ def sweep(cell: list[Run], task: Any, gaps: tuple[int, ...]) -> dict[str, Any]:
 
 def sections(measured: dict[str, Any]) -> list[Any]:
     return [
-        *(figure(measured, variant, "distractors between signals", PUBLISHED_AT_LAST)
-          for variant in fig_3_4a.variants(measured)),
+        *(
+            figure(measured, variant, "distractors between signals", PUBLISHED_AT_LAST)
+            for variant in fig_3_4a.variants(measured)
+        ),
         table(measured, {21: "43.2 ± 13.2"}, "distractors"),
-    ]  # fmt: skip
+    ]
 
 
-def figure(
-    measured: dict[str, Any], variant: str, x_label: str, published: float | None
-) -> Figure:
+def figure(measured: dict[str, Any], variant: str, x_label: str, published: float | None) -> Figure:
     return Figure(
         f"Champions of depth-trained runs, {variant}",
         x_label,
@@ -81,7 +81,12 @@ def table(measured: dict[str, Any], given: dict[int, str], what: str) -> Table:
     last = first[shown[-1]]
     return Table(
         "Success in percent, mean ± standard error over runs",
-        ["depth", "variant", *(f"{first[i]} {what}" for i in shown),
-         f"published at {last}" if last == 101 else "published", f"best run at {last}"],
+        [
+            "depth",
+            "variant",
+            *(f"{first[i]} {what}" for i in shown),
+            f"published at {last}" if last == 101 else "published",
+            f"best run at {last}",
+        ],
         rows,
-    )  # fmt: skip
+    )

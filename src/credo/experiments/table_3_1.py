@@ -45,7 +45,7 @@ def _probe(policy: Any, task: SequenceClassification) -> dict[str, Any]:
     relevant = final[:, list(relevance.needed)]
     sums = np.asarray(states.sums)
     same = [np.ptp(relevant[sums == s], axis=0).max(initial=0.0) for s in np.unique(sums)]
-    signatures = memory.signature(final, relevance.needed)
+    signatures = memory.signature(states.memory, relevance.needed)
     classes = {tuple(s): set() for s in signatures.tolist()}
     for s, total in zip(signatures.tolist(), sums, strict=True):
         classes[tuple(s)].add(bool(total > 0))
@@ -66,20 +66,39 @@ def sections(measured: dict[str, Any]) -> list[Any]:
     best = measured["runs"][measured["champion"]]
     needed = ", ".join(f"M{c + 1}" for c in best["needed"])
     rows = [
-        [str(i + 1), str(p), f"{s:+d}", str(m), str([m[c] for c in best["needed"]]), str(sig),
-         "yes" if right else "no"]
+        [
+            str(i + 1),
+            str(p),
+            f"{s:+d}",
+            str(m),
+            str([m[c] for c in best["needed"]]),
+            str(sig),
+            "yes" if right else "no",
+        ]
         for i, (p, s, m, sig, right) in enumerate(
-            zip(best["permutations"], best["sums"], best["memory"], best["signatures"],
-                best["right"], strict=True))
-    ]  # fmt: skip
+            zip(
+                best["permutations"],
+                best["sums"],
+                best["memory"],
+                best["signatures"],
+                best["right"],
+                strict=True,
+            )
+        )
+    ]
     summary = [
-        [str(i), f"{length:.0f}", f"{sum(run['right'])}/8",
-         ", ".join(f"M{c + 1}" for c in run["needed"]),
-         f"{run['spread within equal sums']:.2g}",
-         "yes" if run["signature predicts class"] else "no"]
+        [
+            str(i),
+            f"{length:.0f}",
+            f"{sum(run['right'])}/8",
+            ", ".join(f"M{c + 1}" for c in run["needed"]),
+            f"{run['spread within equal sums']:.2g}",
+            "yes" if run["signature predicts class"] else "no",
+        ]
         for i, (run, length) in enumerate(
-            zip(measured["runs"], measured["signals right"], strict=True))
-    ]  # fmt: skip
+            zip(measured["runs"], measured["signals right"], strict=True)
+        )
+    ]
     return [
         Table(
             f"Champion of run {measured['champion']}, the best of its cell; needed: {needed}",
@@ -89,8 +108,14 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         ),
         Table(
             "Every run",
-            ["run", "random signals right in a row", "permutations right", "needed cells",
-             "spread within equal sums", "signature predicts class"],
+            [
+                "run",
+                "random signals right in a row",
+                "permutations right",
+                "needed cells",
+                "spread within equal sums",
+                "signature predicts class",
+            ],
             summary,
             caption="Spread: the largest difference of a needed cell's final value between "
             "permutations of equal sum; 0 in the dissertation's champion. Random signals: mean of "
@@ -98,7 +123,9 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         ),
         Text(
             "Masking",
-            ["A masked cell is held at 0 before every step; the needed cells are the smallest set "
-             "that keeps the success over the 8 permutations with all others masked."],
+            [
+                "A masked cell is held at 0 before every step; the needed cells are the smallest set "
+                "that keeps the success over the 8 permutations with all others masked."
+            ],
         ),
-    ]  # fmt: skip
+    ]

@@ -13,8 +13,8 @@ from .base import Cell
 
 TITLE = "counting study"
 PUBLISHED = (
-    "Table 3.2 of the dissertation: after 10^5 signals -1 and then 10^6 signals +1, one cell of the "
-    "champion counted +1 to 1,000,000; the other counted -1 to 1,244 and saturated."
+    "Table 3.2 of the dissertation: after 10^5 signals -1 and then 10^6 signals +1, one cell of "
+    "the champion counted +1 to 1,000,000; the other counted -1 to 1,244 and saturated."
 )
 SIGNALS = {"smoke": (100, 100), "quick": (10_000, 10_000), "full": (100_000, 1_000_000)}
 
@@ -28,9 +28,7 @@ def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
     measured = {}
     for name, cell in runs.items():
         policies = chapter3.champions(cell)
-        study = counting.counting_study(
-            policies, negatives, positives, key=jax.random.key(50_000)
-        )
+        study = counting.counting_study(policies, negatives, positives, key=jax.random.key(50_000))
         right = counting.longest_correct(policies, positives, key=jax.random.key(60_000))
         measured[name] = {
             "fed": [negatives, positives],
@@ -43,8 +41,11 @@ def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:
-    return [section for name, cell in measured.items() for section in (verdicts(name, cell),
-            champion(name, cell))]  # fmt: skip
+    return [
+        section
+        for name, cell in measured.items()
+        for section in (verdicts(name, cell), champion(name, cell))
+    ]
 
 
 def verdicts(name: str, cell: dict[str, Any]) -> Table:
@@ -66,12 +67,18 @@ def verdicts(name: str, cell: dict[str, Any]) -> Table:
         )
     return Table(
         f"{name}: how far each champion counts",
-        ["run", f"-1, of {cell['fed'][0]:,}", f"+1, of {cell['fed'][1]:,}",
-         "random signals right, worst of 10", "median of 10", f"counts to {max(cell['fed']):,}"],
+        [
+            "run",
+            f"-1, of {cell['fed'][0]:,}",
+            f"+1, of {cell['fed'][1]:,}",
+            "random signals right, worst of 10",
+            "median of 10",
+            f"counts to {max(cell['fed']):,}",
+        ],
         rows,
         caption="Counted: the signals of one sign at each of which the cell moved the same way, "
         "before it once did not. Random signals: answered right in a row in streams of ±1.",
-    )  # fmt: skip
+    )
 
 
 def champion(name: str, cell: dict[str, Any]) -> Table:

@@ -1,5 +1,6 @@
 """Feed-forward policy: the memoryless baseline."""
 
+import itertools
 from typing import ClassVar, Literal
 
 import equinox as eqx
@@ -37,7 +38,7 @@ class MLP(AbstractNetwork):
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> "MLPPolicy":
         sizes = (obs_size, *[self.width] * self.depth, action_size)
         shapes: dict[str, tuple[int, ...]] = {}
-        for layer, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        for layer, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
             shapes |= {f"W_{layer}": (fan_out, fan_in), f"b_{layer}": (fan_out,)}
         return MLPPolicy(draw(shapes, self.initializer, key=key), self)
 

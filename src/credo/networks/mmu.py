@@ -136,13 +136,18 @@ class MMUPolicy(AbstractPolicy):
         i = σ(matvec(self.K_i, x) + matvec(self.R_i, y) + matvec(self.N_i, m) + self.b_i)
         p = φ(matvec(self.K_p, x) + matvec(self.N_p, m) + self.b_p)  # (3.1)
         r = σ(matvec(self.K_r, x) + matvec(self.R_r, y) + matvec(self.N_r, m) + self.b_r)
-        d = θ_d(m if self.N_d is None else matvec(self.N_d, m) + self.b_d)  # (3.2)
+        d = θ_d(_affine(self.N_d, m, self.b_d))  # (3.2)
         h = r * d + p * i  # (3.3)
         w = σ(matvec(self.K_w, x) + matvec(self.R_w, y) + matvec(self.N_w, m) + self.b_w)
-        f = θ_f(h if self.Z_f is None else matvec(self.Z_f, h) + self.b_f)
+        f = θ_f(_affine(self.Z_f, h, self.b_f))
         if c.alpha == 0.0:
             m = m + w * f
         else:
             m = (1.0 - c.alpha) * (m + w * f) + c.alpha * (w * f + (1.0 - w) * m)  # (3.4)
         y = φ_y(matvec(self.Z_y, h) + self.b_y)  # (3.5)
         return to_action(y, c.output_activation), (y, m)
+
+
+def _affine(w: Array | None, x: Array, b: Array | None) -> Array:
+    """`w x + b`, or `x` where both are frozen to the identity."""
+    return x if w is None or b is None else matvec(w, x) + b

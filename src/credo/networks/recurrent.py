@@ -69,8 +69,10 @@ class RecurrentPolicy(AbstractPolicy):
 
     def _gate(self, gate, x, h):
         weights = self.weights
-        return matvec(weights[f"W_{gate}"], x) + matvec(weights[f"U_{gate}"], h) + (
-            weights[f"b_{gate}"]
+        return (
+            matvec(weights[f"W_{gate}"], x)
+            + matvec(weights[f"U_{gate}"], h)
+            + (weights[f"b_{gate}"])
         )
 
     def _rnn(self, x, h):

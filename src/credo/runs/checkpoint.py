@@ -262,6 +262,21 @@ def _fit(
     for name, data in arrays.items():
         wrap = functools.partial(jax.random.wrap_key_data, impl=keys.get(name))
         found[name] = _describe(jax.eval_shape(wrap, data) if name in keys else data)
+    _check_same(path, expected, found)
+
+    def leaf(name: str) -> Array:
+        data = arrays.pop(name)
+        array = jnp.array(data)
+        if array.dtype != data.dtype:
+            raise CheckpointError(f"{path}: {name} is {_describe(data)}: set jax_enable_x64")
+        return jax.random.wrap_key_data(array, impl=keys[name]) if name in keys else array
+
+    return jax.tree.unflatten(
+        structure, [leaf(keystr(at)) if _is_array(old) else old for at, old in paths]
+    )
+
+
+def _check_same(path: Path, expected: dict[str, str], found: dict[str, str]) -> None:
     differing = [
         f"\n  {name}: found {found.get(name, 'no array')}, "
         f"expected {expected.get(name, 'no array')}"
@@ -274,17 +289,6 @@ def _fit(
             f"{path} does not fit: {len(differing)} leaves differ from what is expected"
             f"{''.join(differing[:10])}{more}\nUse the config that it was written with."
         )
-
-    def leaf(name: str) -> Array:
-        data = arrays.pop(name)
-        array = jnp.array(data)
-        if array.dtype != data.dtype:
-            raise CheckpointError(f"{path}: {name} is {_describe(data)}: set jax_enable_x64")
-        return jax.random.wrap_key_data(array, impl=keys[name]) if name in keys else array
-
-    return jax.tree.unflatten(
-        structure, [leaf(keystr(at)) if _is_array(old) else old for at, old in paths]
-    )
 
 
 # The bytes of a file. The format's library writes without fsync, reports a full disk without its

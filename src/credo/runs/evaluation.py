@@ -22,9 +22,14 @@ def describe(run: Run, task: Any, episodes: int, seed: int) -> Iterator[str]:
     if isinstance(task, SequenceClassification) and task.depth > STREAMED:
         streams = min(episodes, 20)
         lengths = counting.longest_correct(
-            policies, task.depth, streams, min_gap=task.min_gap, max_gap=task.max_gap,
-            ties=task.ties, key=key,
-        )[0]  # fmt: skip
+            policies,
+            task.depth,
+            streams,
+            min_gap=task.min_gap,
+            max_gap=task.max_gap,
+            ties=task.ties,
+            key=key,
+        )[0]
         yield f"{run.path}: {streams} streams of {task.depth:,} signals"
         yield f"  success          {np.mean(np.asarray(lengths) >= task.depth):.3f}"
         yield f"  signals right    median {int(np.median(lengths)):,}, worst {int(lengths.min()):,}"

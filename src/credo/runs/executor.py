@@ -31,7 +31,9 @@ class Job:
 
     @property
     def tree(self) -> dict[str, Any]:
-        tree = self.algorithm if isinstance(self.algorithm, dict) else config.to_tree(self.algorithm)
+        tree = (
+            self.algorithm if isinstance(self.algorithm, dict) else config.to_tree(self.algorithm)
+        )
         return json.loads(json.dumps(tree))
 
     def finished(self) -> bool:
@@ -105,8 +107,11 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
                 left = (time.monotonic() - began) / done * (len(waiting) - done)
                 bar.update(task, advance=1, text=f"left {left / 60:.1f} min")
                 if not console.is_terminal:
-                    print(f"{title}: {done}/{len(waiting)} {job.path}, left {left / 60:.1f} min",
-                          file=sys.stderr, flush=True)  # fmt: skip
+                    print(
+                        f"{title}: {done}/{len(waiting)} {job.path}, left {left / 60:.1f} min",
+                        file=sys.stderr,
+                        flush=True,
+                    )
             if process.poll() is not None:
                 process = _start(core)
                 assert process.stdin is not None

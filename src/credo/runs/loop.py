@@ -88,7 +88,9 @@ class Policy:
     def __init__(self, policy: PyTree):
         arrays, self._static = eqx.partition(policy, eqx.is_array)
         self._arrays = arrays
-        self._step = jax.jit(lambda arrays, obs, carry: eqx.combine(arrays, self._static)(obs, carry))
+        self._step = jax.jit(
+            lambda arrays, obs, carry: eqx.combine(arrays, self._static)(obs, carry)
+        )
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -144,7 +146,7 @@ def train(
         "budget": {"generations": generations, "stop_at": stop_at},
         "machine": config.machine(),
     }
-    options = dict(checkpoint_every=checkpoint_every, keep=keep, tensorboard=tensorboard)
+    options = {"checkpoint_every": checkpoint_every, "keep": keep, "tensorboard": tensorboard}
     with lock(path):
         state = _initial(algorithm, jax.random.key(seed))
         # The first checkpoint comes before the config: what has a config can be resumed.
@@ -214,7 +216,6 @@ def _train(run, algorithm, wall_clock, *, checkpoint_every, keep, tensorboard, p
     before = log.read(run.path / "timing.csv").get("seconds", np.zeros(1))[-1]
     began = last_save = time.monotonic()
     chunk, ended = 1, False
-    save = lambda: _save(run, algorithm, generation, state, frames, keep)  # noqa: E731
 
     with Signals() as signals, Progress(run.path, generation, budget, progress) as bar:
         while generation < budget and score < stop_score and not ended and not signals.received:
@@ -235,16 +236,17 @@ def _train(run, algorithm, wall_clock, *, checkpoint_every, keep, tensorboard, p
             journal.append(batch, seconds, before + now - began)
             bar.update(generation, batch[-1], seconds, len(batch))
             if callback is not None:
-                ended = any([callback(row["generation"], row) for row in batch])
+                answers = [callback(row["generation"], row) for row in batch]
+                ended = any(answers)
             ended = ended or (wall_clock is not None and now - began >= wall_clock)
             if now - last_save >= checkpoint_every:
-                save()
+                _save(run, algorithm, generation, state, frames, keep)
                 last_save = now
             # The first dispatch compiles; from the second on, its length follows the clock.
             # How many generations one dispatch holds is data and changes no result.
             chunk = 2 if chunk == 1 else int(np.clip(n * DISPATCH / seconds, 1, CHUNK))
         journal.close()
-        save()
+        _save(run, algorithm, generation, state, frames, keep)
     if signals.received and generation < budget:
         raise Interrupted(
             f"stopped at generation {generation} of {budget} and saved; go on with "
@@ -295,9 +297,7 @@ def _initial(algorithm: Any, root: PRNGKeyArray) -> PyTree:
 
 def _save(run: Run, algorithm: Any, generation: int, state: PyTree, frames: int, keep: int):
     arrays = eqx.filter(state, eqx.is_array)
-    checkpoint.save(
-        run.path / "checkpoints", generation, arrays, {"frames": frames}, keep=keep
-    )
+    checkpoint.save(run.path / "checkpoints", generation, arrays, {"frames": frames}, keep=keep)
     metadata = {"algorithm": json.dumps(config.to_tree(algorithm)), "generation": str(generation)}
     checkpoint.export_policy(run.path / "champion.safetensors", state.champion, metadata)
 
@@ -306,10 +306,10 @@ def _score_at(rows: dict[str, np.ndarray], generation: int) -> float:
     if generation == 0 or "champion_score" not in rows:
         return -np.inf
     match = np.flatnonzero(rows["generation"] == generation)
-    return rows["champion_score"][match[-1]] if match.size else -np.inf
+    return float(rows["champion_score"][match[-1]]) if match.size else -np.inf
 
 
-def free_name(algorithm: Any, seed: int) -> pathlib.Path:
+def free_name(algorithm: Any, seed: int | str) -> pathlib.Path:
     name = f"{type(algorithm).__name__}-{type(algorithm.env).__name__}-{seed}".lower()
     path, copies = pathlib.Path("runs") / name, 1
     while path.exists():

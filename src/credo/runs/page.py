@@ -50,6 +50,10 @@ class Reference:
     label: str
     value: float
 
+    def __post_init__(self):
+        if not math.isfinite(self.value):
+            raise ValueError(f"reference {self.label!r} is {self.value}: a level must be finite")
+
 
 @dataclass(frozen=True, eq=False)
 class Figure:

@@ -19,7 +19,9 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure as Canvas
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.lines import Line2D
+from matplotlib.text import Text as Words
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from ..analysis.statistics import bootstrap_interval
@@ -49,6 +51,7 @@ STYLE: dict[Any, Any] = {
     "legend.fontsize": 9,
     "axes.linewidth": 0.8,
     "axes.formatter.limits": (-4, 5),
+    "axes.formatter.useoffset": False,
     "path.simplify": True,
     "path.simplify_threshold": 0.2,
 }
@@ -128,7 +131,7 @@ def note(figure: Figure | HeatMap) -> str:
         ]
     longest = max(np.shape(curve.x)[0] for curve in figure.curves)
     if longest > drawn_points(figure):
-        parts.append(f"{drawn_points(figure)} of {longest:,} points are drawn, unsmoothed.")
+        parts.append(f"Up to {drawn_points(figure)} of {longest:,} points are drawn, unsmoothed.")
     return " ".join(parts)
 
 
@@ -194,7 +197,7 @@ def draw(figure: Figure | HeatMap, theme: Theme) -> Canvas:
 
 
 def draw_curves(canvas: Canvas, axes: Axes, figure: Figure, theme: Theme) -> None:
-    handles = [
+    lines = [
         draw_curve(axes, index, curve, figure, theme) for index, curve in enumerate(figure.curves)
     ]
     axes.grid(axis="y", color=theme.grid, linewidth=0.7)
@@ -203,22 +206,23 @@ def draw_curves(canvas: Canvas, axes: Axes, figure: Figure, theme: Theme) -> Non
     if figure.log_x:
         axes.set_xscale("log")
         axes.xaxis.set_minor_formatter(NullFormatter())
+        first, last = axes.get_xlim()
+        if last < 300 * first:  # powers of ten alone would be two labels or none
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     if figure.y_range is not None:
-        levels = [line.value for line in figure.references]
-        low, high = (
-            min(figure.y_range[0], *levels, figure.y_range[1]),
-            max(*figure.y_range, *levels),
-        )
+        levels = [*figure.y_range, *(line.value for line in figure.references)]
+        low, high = min(levels), max(levels)
         axes.set_ylim(low - 0.03 * (high - low), high + 0.03 * (high - low))
     for line in figure.references:
         axes.axhline(line.value, color=theme.muted, linewidth=1, dashes=(4, 3), zorder=1.5)
     shorten_ticks(axes.xaxis, always=figure.log_x)
     shorten_ticks(axes.yaxis)
-    add_legend(canvas, handles, theme)
+    named = [line for line, curve in zip(lines, figure.curves, strict=True) if curve.label.strip()]
+    add_legend(canvas, named, theme)
     label_references(canvas, axes, figure.references, theme)
 
 
-def draw_curve(axes: Axes, index: int, curve: Curve, figure: Figure, theme: Theme):
+def draw_curve(axes: Axes, index: int, curve: Curve, figure: Figure, theme: Theme) -> Line2D:
     """Seeds, interval and centre of one curve; the line that stands for it in the legend."""
     color = theme.curves[index % len(theme.curves)]
     dashes = DASHES[index % len(DASHES)] if len(figure.curves) > 3 else DASHES[0]
@@ -287,9 +291,8 @@ def short_number(value: float) -> str:
     return f"{value:g}".replace("-", "−")
 
 
-def add_legend(canvas: Canvas, handles: Sequence[Any], theme: Theme) -> None:
+def add_legend(canvas: Canvas, handles: Sequence[Line2D], theme: Theme) -> None:
     """A legend below the axes, in as many columns as fit; the canvas grows by its height."""
-    handles = [line for line in handles if line.get_label()]
     if not handles:
         return
     for most in range(min(len(handles), 4), 0, -1):
@@ -319,7 +322,14 @@ def label_references(
     lines = sorted(references, key=lambda line: line.value)
     bottom, top = axes.get_ylim()
     ends = [(line.value - bottom) / (top - bottom) for line in lines]
-    leader = {"arrowstyle": "-", "color": theme.muted, "lw": 0.8, "shrinkA": 0, "shrinkB": 0}
+    leader = {
+        "arrowstyle": "-",
+        "color": theme.muted,
+        "linewidth": 0.8,
+        "shrinkA": 0,
+        "shrinkB": 0,
+        "relpos": (0.0, 0.5),  # it ends at the left of the name, not in the middle of it
+    }
     labels = [
         axes.annotate(
             textwrap.fill(line.label, 15),
@@ -337,9 +347,9 @@ def label_references(
     ]
     canvas.draw_without_rendering()
     height = axes.get_window_extent().height
-    # Text alone: the extent of an annotation includes its leader line.
-    heights = [(9 * 1.25 * label.get_text().count("\n") + 11) / 72 for label in labels]
-    places = spread_out(ends, [h * canvas.dpi / height for h in heights])
+    # The extent of an annotation includes its leader line, that of its text does not.
+    heights = [Words.get_window_extent(label).height / height for label in labels]
+    places = spread_out(ends, [share + 0.015 for share in heights])
     for label, place in zip(labels, places, strict=True):
         label.xyann = (1.05, place)
 

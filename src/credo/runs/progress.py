@@ -6,7 +6,8 @@ import time
 
 from rich.console import Console
 from rich.live import Live
-from rich.progress import BarColumn, Progress as Bar, TextColumn
+from rich.progress import BarColumn, TextColumn
+from rich.progress import Progress as Bar
 
 
 class Progress:

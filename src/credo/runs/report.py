@@ -10,7 +10,8 @@ from ..analysis import floors, statistics
 from ..environments.base import AbstractSequenceTask
 from . import config
 from .loop import Run, RunError
-from .page import Curve, Figure, Page, Reference, Table, write as write_page
+from .page import Curve, Figure, Page, Reference, Table
+from .page import write as write_page
 
 
 def write(paths: list[pathlib.Path], target: pathlib.Path) -> pathlib.Path:
@@ -91,7 +92,9 @@ def _table(runs: dict[str, list[Run]]) -> Table:
         task = group[0].algorithm.env
         known = floors.floor(task) if floors.known(task) else None
         mean, error = statistics.mean_and_standard_error(scores)
-        spread = f"{float(mean):.3f} ± {float(error):.3f}" if len(scores) > 1 else f"{scores[0]:.3f}"
+        spread = (
+            f"{float(mean):.3f} ± {float(error):.3f}" if len(scores) > 1 else f"{scores[0]:.3f}"
+        )
         rows.append(
             [
                 label,
@@ -113,9 +116,7 @@ def _table(runs: dict[str, list[Run]]) -> Table:
 
 
 def _settings(runs: dict[str, list[Run]]) -> Table:
-    flat = {
-        label: config.flatten(group[0].config["algorithm"]) for label, group in runs.items()
-    }
+    flat = {label: config.flatten(group[0].config["algorithm"]) for label, group in runs.items()}
     keys = dict.fromkeys(key for tree in flat.values() for key in tree)
     return Table(
         "Settings",
