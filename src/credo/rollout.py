@@ -101,17 +101,24 @@ def play_sequences(
     )
 
     def body(t, loop):
-        carry, fitness, perfect = loop
+        carry, fitness, rights, perfect = loop
         x = jnp.broadcast_to(inputs[t], (inputs.shape[1], *lanes))
         answer, carry = packed(x, carry)
         target, counts = targets[t], scored[t]
-        perfect = perfect & (~counts | correct(answer[0], target))
+        right = correct(answer[0], target)
+        perfect = perfect & (~counts | right)
         reward = task.reward(answer[0], target, counts, perfect)
-        return carry, fitness + jnp.where(t < lengths, reward, 0.0), perfect
+        fitness = fitness + jnp.where(t < lengths, reward, 0.0)
+        return carry, fitness, rights + (counts & right).astype(jnp.int32), perfect
 
-    start = (carry, jnp.zeros(lanes), jnp.ones(lanes, bool))
-    _, fitness, perfect = jax.lax.fori_loop(0, jnp.max(lengths), body, start)
-    returns = {"fitness": fitness.T, "success": perfect.T.astype(jnp.float32)}
+    start = (carry, jnp.zeros(lanes), jnp.zeros(lanes, jnp.int32), jnp.ones(lanes, bool))
+    _, fitness, rights, perfect = jax.lax.fori_loop(0, jnp.max(lengths), body, start)
+    asked = jnp.sum(scored.astype(jnp.int32), axis=0)
+    returns = {
+        "fitness": fitness.T,
+        "accuracy": (rights.astype(jnp.float32) / asked.astype(jnp.float32)).T,
+        "success": perfect.T.astype(jnp.float32),
+    }
     return Evaluation(returns, jnp.broadcast_to(lengths.T, (pop, lanes[0])))
 
 

@@ -122,7 +122,7 @@ def test_longest_correct_finds_the_first_mistake(three):
     assert found[1].tolist() == expected.tolist()
 
 
-@pytest.mark.parametrize("ties", ["class 1", "free"])
+@pytest.mark.parametrize("ties", ["positive", "free"])
 def test_a_stream_equals_the_trace_of_the_laid_out_sequence(ties):
     depth, streams = 24, 2
     population = eqx.filter_vmap(lambda key: MMU(hidden=4).init(1, 1, key=key))(

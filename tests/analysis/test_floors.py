@@ -25,7 +25,7 @@ def enumerate_all(depth, ties):
     }
 
 
-@pytest.mark.parametrize("ties", ["class 1", "free"])
+@pytest.mark.parametrize("ties", ["positive", "free"])
 @pytest.mark.parametrize("depth", [1, 2, 3, 6, 11])
 def test_classification_floors_equal_full_enumeration(depth, ties):
     assert floors.classification_floors(depth, ties) == enumerate_all(depth, ties)
@@ -34,8 +34,8 @@ def test_classification_floors_equal_full_enumeration(depth, ties):
 @pytest.mark.parametrize(
     ("depth", "ties", "first", "echo"),
     [
-        (5, "class 1", 0.500, 0.188),
-        (21, "class 1", 0.256, 0.000),
+        (5, "positive", 0.500, 0.188),
+        (21, "positive", 0.256, 0.000),
         (5, "free", 0.625, 0.438),
         (21, "free", 0.336, 0.002),
     ],
@@ -72,7 +72,7 @@ def test_errors_name_what_is_allowed():
         floors.classification_floors(0)
     with pytest.raises(ValueError, match="depth is 0"):
         floors.recall_floors(0)
-    with pytest.raises(ValueError, match="'class 1' or 'free'"):
+    with pytest.raises(ValueError, match="'positive' or 'free'"):
         floors.classification_floors(3, "half")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="int"):
         floors.floor(3)  # pyright: ignore[reportArgumentType]

@@ -10,28 +10,36 @@ Departures from the printed box:
 """
 
 from collections.abc import Callable
-from typing import Self
+from typing import Any, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from .. import tree
+from .. import require, tree
 from ..compilation import jit
-from ..environments.base import AbstractEnvironment
+from ..environments.base import AbstractEnvironment, AbstractSequenceTask
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
+from ..evolution.curriculum import Curriculum
 from ..evolution.extinction import Extinction
 from ..evolution.mutation import AbstractMutation, MatrixMutation
 from ..evolution.selection import AbstractSelection, Tournament, rankable, ranking, repeated
 from ..networks.base import AbstractNetwork
 from ..rollout import evaluate
-from ..types import Metrics
+from ..types import Evaluation, Metrics
+
+
+def _names(signals: str | tuple[str, ...]) -> tuple[str, ...]:
+    return (signals,) if isinstance(signals, str) else tuple(signals)
 
 
 class NeuroevolutionState(eqx.Module):
     population: PyTree  # leaves [pop, ...]; bred, not yet evaluated
     champion: PyTree  # the best of the generation before
+    record: Float[Array, " pop"]  # mean fitness of a member in earlier generations
+    age: Int[Array, " pop"]  # how many generations that mean is over; 0: bred just now
+    level: Int[Array, ""]  # of the curriculum
 
 
 class Neuroevolution(eqx.Module):
@@ -50,18 +58,28 @@ class Neuroevolution(eqx.Module):
     cross_repeated: bool = eqx.field(static=True, default=False)
     """Cross every parent that selection drew before, so that no two offspring are clones."""
     extinction: Extinction = Extinction(probability=0.0)
-    fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
+    elite_memory: int = eqx.field(static=True, default=1)
+    """Generations over which the fitness of an elite is averaged; 1: the last alone."""
+    curriculum: Curriculum | None = None  # None: the whole task from the start
+    fitness: tuple[str, ...] = eqx.field(static=True, default=(), converter=_names)
+    """Reward signals whose sum is the fitness; none: the task's first."""
     score: str | None = eqx.field(static=True, default=None)  # signal; None: the task's last
 
     def __check_init__(self):
-        if self.population_size < 2:
-            raise ValueError(f"population_size is {self.population_size}: needs at least 2")
-        if not 0.0 <= self.elite_fraction < 1.0:
-            raise ValueError(f"elite_fraction is {self.elite_fraction}: it must lie in [0, 1)")
-        for name in ("episodes", "test_episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be at least 1")
-        for name in (self.fitness, self.score):
+        for name, minimum in (
+            ("population_size", 2),
+            ("episodes", 1),
+            ("test_episodes", 1),
+            ("elite_memory", 1),
+        ):
+            require.at_least(name, getattr(self, name), minimum)
+        require.within("elite_fraction", self.elite_fraction, 0, 1)
+        require.within("crossover_probability", self.crossover_probability, 0, 1)
+        if self.elites >= self.population_size:
+            raise ValueError(
+                f"elite_fraction is {self.elite_fraction}: no room is left for offspring; lower it"
+            )
+        for name in (*self.fitness, self.score):
             if name is not None and name not in self.env.signals:
                 raise ValueError(
                     f"no reward signal {name!r}: this task has {', '.join(self.env.signals)}"
@@ -83,7 +101,13 @@ class Neuroevolution(eqx.Module):
 
     @classmethod
     def ours(cls, env: AbstractEnvironment, network: AbstractNetwork, **overrides) -> Self:
-        return cls.as_coded(env, network, **overrides)
+        """The best settings found (docs/neuroevolution.md has their ablation): the author's
+        operators, a curriculum, the share of right answers as fitness, and elites that are judged
+        by several generations."""
+        settings: dict[str, Any] = {"elite_memory": 6}
+        if isinstance(env, AbstractSequenceTask):
+            settings |= {"curriculum": Curriculum(), "fitness": ("accuracy", "success")}
+        return cls.as_coded(env, network, **settings | overrides)
 
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
@@ -103,7 +127,11 @@ class Neuroevolution(eqx.Module):
     def init(self, *, key: PRNGKeyArray) -> NeuroevolutionState:
         # 1: Initialize a population of k neural networks.
         population = self.new_population(key=key)
-        return NeuroevolutionState(population, tree.take(population, 0))
+        k = self.population_size
+        level = jnp.int32(self.curriculum.start if self.curriculum else 0)
+        return NeuroevolutionState(
+            population, tree.take(population, 0), jnp.zeros(k), jnp.zeros(k, jnp.int32), level
+        )
 
     def generation(
         self, state: NeuroevolutionState, *, key: PRNGKeyArray
@@ -111,25 +139,58 @@ class Neuroevolution(eqx.Module):
         """Lines 3-12 of Algorithm 2, and the test of the champion that the text describes."""
         evaluate_key, breed_key, test_key = jax.random.split(key, 3)
         population = state.population
+        env = self.curriculum.task(self.env, state.level) if self.curriculum else self.env
 
         # 4-5: for each network, compute fitness.
-        evaluation = evaluate(self.env, population, self.episodes, key=evaluate_key)
-        fitness = jnp.mean(evaluation.returns[self.fitness or self.env.signals[0]], axis=1)
+        evaluation = evaluate(env, population, self.episodes, key=evaluate_key)
+        fitness, returns = assess(self, state, evaluation)
 
         # 6-12: rank; keep the elites; select, and mutate the selected.
+        order = ranking(fitness)
         bred = breed(self, population, fitness, key=breed_key)
+        record, age = remember(self, state, fitness, order)
 
-        # The network with the highest fitness is tested on fresh episodes.
-        champion = tree.take(population, ranking(fitness)[:1])
+        # The network with the highest fitness is tested on fresh episodes of the whole task.
+        champion = tree.take(population, order[:1])
         test = evaluate(self.env, champion, self.test_episodes, key=test_key)
+        score = self.score or self.env.signals[-1]
         metrics = {
             "fitness_max": jnp.max(rankable(fitness)),
-            "fitness_mean": jnp.mean(fitness),
-            "fitness_nan": jnp.sum(jnp.isnan(fitness)),
-            "champion_score": jnp.mean(test.returns[self.score or self.env.signals[-1]]),
+            "fitness_mean": jnp.nanmean(returns),
+            "fitness_nan": jnp.sum(jnp.isnan(returns)),
+            "champion_score": jnp.mean(test.returns[score]),
             "frames": jnp.sum(evaluation.steps),
         }
-        return NeuroevolutionState(bred, tree.take(champion, 0)), metrics
+        level = state.level
+        if self.curriculum:
+            metrics["level"] = level
+            level = self.curriculum.next(level, jnp.mean(evaluation.returns[score][order[0]]))
+        return NeuroevolutionState(bred, tree.take(champion, 0), record, age, level), metrics
+
+
+@jit
+def assess(
+    algorithm: Neuroevolution, state: NeuroevolutionState, evaluation: Evaluation
+) -> tuple[Float[Array, " pop"], Float[Array, " pop"]]:
+    """Fitness, with earlier generations of an elite averaged in; and that of this one alone."""
+    signals = algorithm.fitness or algorithm.env.signals[:1]
+    total = jnp.stack([evaluation.returns[name] for name in signals]).sum(axis=0)
+    returns = jnp.mean(total, axis=1)
+    age = state.age.astype(jnp.float32)
+    return (state.record * age + returns) / (age + 1.0), returns
+
+
+@jit
+def remember(
+    algorithm: Neuroevolution,
+    state: NeuroevolutionState,
+    fitness: Float[Array, " pop"],
+    order: Int[Array, " pop"],
+) -> tuple[Float[Array, " pop"], Int[Array, " pop"]]:
+    """Record and age of the next population: the elites', then none."""
+    elite = jnp.arange(algorithm.population_size) < algorithm.elites
+    age = jnp.minimum(state.age[order] + 1, algorithm.elite_memory - 1)
+    return jnp.where(elite, fitness[order], 0.0), jnp.where(elite, age, 0)
 
 
 @jit

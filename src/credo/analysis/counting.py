@@ -103,7 +103,7 @@ def stream(
     gaps: Callable[[Int[Array, ""]], Int[Array, ""]],
     checkpoints: Int[Array, " checkpoints"],
     *,
-    ties: Literal["class 1", "free"] = "class 1",
+    ties: Literal["positive", "free"] = "positive",
     minimum: float = 0.05,
     until_mistake: bool = False,
 ) -> Stream:
@@ -183,7 +183,7 @@ def _tally(loop: _Loop, signal, answer, carry, memory, move, ties) -> _Loop:
     of_sign = jnp.stack([signal < 0, signal > 0])
     fed_of_sign = loop.fed_of_sign + of_sign.astype(jnp.int32)
     total = (fed_of_sign[1] - fed_of_sign[0]).astype(jnp.float32)
-    right = correct(answer, total + 0.5 if ties == "class 1" else total)
+    right = correct(answer, total + 0.5 if ties == "positive" else total)
     right = right & (loop.correct == loop.fed)
 
     of_sign, way = of_sign[:, None], jnp.sign(move)[None]
@@ -274,7 +274,7 @@ def longest_correct(
     *,
     min_gap: int = 10,
     max_gap: int = 20,
-    ties: Literal["class 1", "free"] = "class 1",
+    ties: Literal["positive", "free"] = "positive",
     key: PRNGKeyArray,
 ) -> Int[Array, "policies streams"]:
     """Signals of random streams answered right before the first mistake; `depth` if none.

@@ -19,10 +19,10 @@ from ..environments.sequence_recall import SequenceRecall
 CEILING = 1.0
 """Success of a perfect memory on either task, at any depth: neither hides anything."""
 
-Ties = Literal["class 1", "free"]
+Ties = Literal["positive", "free"]
 
 
-def classification_floors(depth: int, ties: Ties = "class 1") -> dict[str, float]:
+def classification_floors(depth: int, ties: Ties = "positive") -> dict[str, float]:
     """Strict success of trivial policies on Sequence Classification.
 
     **Arguments:** `depth` signals, at least 1 (the work grows with its square); `ties` as in
@@ -30,8 +30,8 @@ def classification_floors(depth: int, ties: Ties = "class 1") -> dict[str, float
     **Returns:** the probability, in [0, 1], that every signal of a sequence is answered right.
     """
     _check_depth(depth)
-    if ties not in ("class 1", "free"):
-        raise ValueError(f"ties is {ties!r}: it must be 'class 1' or 'free'")
+    if ties not in ("positive", "free"):
+        raise ValueError(f"ties is {ties!r}: it must be 'positive' or 'free'")
 
     def success(answer: Callable[[int, int], int]) -> float:
         return _solved(depth, ties, answer) / 2**depth

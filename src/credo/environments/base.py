@@ -58,12 +58,12 @@ class AbstractSequenceTask(AbstractEnvironment):
 
     A task says how to `sample` a labelled sequence and what an answer earns; the environment
     below and the fast path of `rollout.evaluate` both follow from that.
-    Signals: `fitness`, the sum of `reward` over all steps before the padding; and `success`, 1 at
-    the last step if every scored answer of the sequence was right.
+    Signals: `fitness`, the sum of `reward` over all steps before the padding; `accuracy`, the
+    share of the scored answers that were right; and `success`, 1 at the last step if all were.
     """
 
     action_size: ClassVar[int] = 1
-    signals: ClassVar[tuple[str, ...]] = ("fitness", "success")
+    signals: ClassVar[tuple[str, ...]] = ("fitness", "accuracy", "success")
 
     @abc.abstractmethod
     def sample(self, *, key: PRNGKeyArray) -> Sequence:
@@ -83,26 +83,32 @@ class AbstractSequenceTask(AbstractEnvironment):
     def reset(self, *, key: PRNGKeyArray) -> tuple[SequenceState, TimeStep]:
         sequence = self.sample(key=key)
         state = SequenceState(sequence, jnp.int32(0), jnp.bool_(True))
-        return state, _time_step(state, jnp.float32(0.0), jnp.float32(0.0))
+        return state, _time_step(state, {name: jnp.float32(0.0) for name in self.signals})
 
     def step(
         self, state: SequenceState, action: Float[Array, " 1"], *, key: PRNGKeyArray
     ) -> tuple[SequenceState, TimeStep]:
         sequence, step = state.sequence, state.step
         target, scored = sequence.targets[step], sequence.scored[step]
-        perfect = state.perfect & (~scored | correct(action[0], target))
-        reward = self.reward(action[0], target, scored, perfect)
+        right = correct(action[0], target)
+        perfect = state.perfect & (~scored | right)
+        asked = jnp.sum(sequence.scored.astype(jnp.float32))
+        ends = step + 1 >= sequence.length
+        rewards = {
+            "fitness": self.reward(action[0], target, scored, perfect),
+            "accuracy": (scored & right).astype(jnp.float32) / asked,
+            "success": (ends & perfect).astype(jnp.float32),
+        }
         state = SequenceState(sequence, step + 1, perfect)
-        success = jnp.where(state.step >= sequence.length, perfect.astype(jnp.float32), 0.0)
-        return state, _time_step(state, reward, success)
+        return state, _time_step(state, rewards)
 
 
 def correct(answer: Float[Array, "*b"], target: Float[Array, "*b"]) -> Bool[Array, "*b"]:
-    """An answer of 0 or more means class +1. A target of 0 accepts anything."""
-    return (target == 0) | ((answer >= 0) == (target > 0))
+    """An answer of 0 or more means class +1. A target of 0 accepts anything; NaN is no answer."""
+    return (target == 0) | jnp.where(target > 0, answer >= 0, answer < 0)
 
 
-def _time_step(state: SequenceState, reward: Array, success: Array) -> TimeStep:
+def _time_step(state: SequenceState, rewards: dict[str, Array]) -> TimeStep:
     ended = state.step >= state.sequence.length
     obs = state.sequence.inputs[jnp.minimum(state.step, state.sequence.length - 1)]
-    return TimeStep(obs, {"fitness": reward, "success": success}, ended, jnp.bool_(False))
+    return TimeStep(obs, rewards, ended, jnp.bool_(False))

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from .. import require
 from ..types import Sequence
 from .base import AbstractSequenceTask
 
@@ -38,18 +39,16 @@ class SequenceClassification(AbstractSequenceTask):
     depth: int = eqx.field(static=True, default=21)  # signals per sequence, at least 1
     min_gap: int = eqx.field(static=True, default=10)  # zeros between two signals, at least
     max_gap: int = eqx.field(static=True, default=20)  # zeros between two signals, at most
-    ties: Literal["class 1", "free"] = eqx.field(static=True, default="class 1")
+    ties: Literal["positive", "free"] = eqx.field(static=True, default="positive")
     """The right answer at a running sum of 0: +1, or anything."""
 
     def __check_init__(self):
-        if self.depth < 1:
-            raise ValueError(f"depth is {self.depth}: it must be at least 1 signal")
+        require.at_least("depth", self.depth, 1)
         if not 0 <= self.min_gap <= self.max_gap:
             raise ValueError(
                 f"gaps of {self.min_gap}..{self.max_gap} zeros: needs 0 <= min_gap <= max_gap"
             )
-        if self.ties not in ("class 1", "free"):
-            raise ValueError(f"ties is {self.ties!r}: it must be 'class 1' or 'free'")
+        require.choice("ties", self.ties, ("positive", "free"))
 
     @property
     def obs_size(self) -> int:
@@ -74,7 +73,7 @@ class SequenceClassification(AbstractSequenceTask):
         scored = jnp.zeros(self.max_steps, bool).at[position].set(True)
         inputs = jnp.zeros(self.max_steps).at[position].set(signals)
         running = jnp.cumsum(inputs) + total
-        targets = running + 0.5 if self.ties == "class 1" else running
+        targets = running + 0.5 if self.ties == "positive" else running
         return Sequence(inputs[:, None], targets, scored, position[-1] + 1)
 
     def reward(

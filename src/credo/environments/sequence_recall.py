@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from .. import require
 from ..types import Sequence
 from .base import AbstractSequenceTask
 
@@ -36,13 +37,15 @@ class SequenceRecall(AbstractSequenceTask):
     """Steps per unit of distance; None: `max_corridor`, so that distances lie in [0, 1]."""
 
     def __check_init__(self):
-        if self.depth < 1:
-            raise ValueError(f"depth is {self.depth}: it must be at least 1 junction")
+        require.at_least("depth", self.depth, 1)
         if not 1 <= self.min_corridor <= self.max_corridor:
             raise ValueError(
                 f"corridors of {self.min_corridor}..{self.max_corridor} steps: "
                 "needs 1 <= min_corridor <= max_corridor"
             )
+
+        if self.unit is not None:
+            require.at_least("unit", self.unit, 1)
 
     @property
     def obs_range(self) -> tuple[float, float]:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray, PyTree
 
-from .. import tree
+from .. import require, tree
 
 
 class AbstractCrossover(eqx.Module):
@@ -28,8 +28,8 @@ class MaskedCrossover(AbstractCrossover):
     probability: float = 0.5  # chance that a part is from `b`, in [0, 1]
 
     def __check_init__(self):
-        if self.part not in ("matrix", "row", "entry"):
-            raise ValueError(f"part is {self.part!r}: it must be 'matrix', 'row' or 'entry'")
+        require.choice("part", self.part, ("matrix", "row", "entry"))
+        require.within("probability", self.probability, 0, 1)
 
     def __call__(self, a: PyTree, b: PyTree, *, key: PRNGKeyArray) -> PyTree:
         mine, unravel, layout = tree.ravel(a)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 from jaxtyping import PRNGKeyArray, PyTree
 
-from .. import tree
+from .. import require, tree
 
 
 class Extinction(eqx.Module):
@@ -13,6 +13,10 @@ class Extinction(eqx.Module):
 
     probability: float = 0.004  # per generation, in [0, 1]
     magnitude: float = 0.5  # share of the members that dies, in [0, 1]
+
+    def __check_init__(self):
+        require.within("probability", self.probability, 0, 1)
+        require.within("magnitude", self.magnitude, 0, 1)
 
     def __call__(self, population: PyTree, fresh: PyTree, *, key: PRNGKeyArray) -> PyTree:
         """`population` and `fresh` `[pop, ...]`; spare the elites by not passing them."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from .. import tree
+from .. import require, tree
 
 
 class AbstractMutation(eqx.Module):
@@ -44,11 +44,10 @@ class MatrixMutation(AbstractMutation):
 
     def __check_init__(self):
         for name in ("probability", "fraction", "super_probability", "reset_probability"):
-            value = getattr(self, name)
-            if isinstance(value, float) and not 0.0 <= value <= 1.0:
-                raise ValueError(f"{name} is {value}: it must lie in [0, 1]")
-        if self.gate not in ("matrix", "genome"):
-            raise ValueError(f"gate is {self.gate!r}: it must be 'matrix' or 'genome'")
+            require.within(name, getattr(self, name), 0, 1)
+        for name in ("strength", "floor", "super_strength", "reset_std", "limit"):
+            require.at_least(name, getattr(self, name), 0)
+        require.choice("gate", self.gate, ("matrix", "genome"))
 
     def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
         gate_key, hit_key, move_key = jax.random.split(key, 3)
@@ -72,7 +71,8 @@ class MatrixMutation(AbstractMutation):
         sure = jnp.floor(sizes * jax.random.uniform(sure_key, sizes.shape)).astype(jnp.int32)
         # One entry for sure, the others by chance: `count` on average.
         others = (count - 1.0) / jnp.maximum(sizes - 1.0, 1.0)
-        return (u < others[layout.leaf]) | (layout.place == sure[layout.leaf])
+        hit = (u < others[layout.leaf]) | (layout.place == sure[layout.leaf])
+        return hit & (most > 0.0)[layout.leaf]
 
     def moved(self, w: Float[Array, " n"], *, key: PRNGKeyArray) -> Float[Array, " n"]:
         """Every weight as it is after a hit."""

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from .. import require
+
 
 def rankable(fitness: Float[Array, " pop"]) -> Float[Array, " pop"]:
     """Fitness with NaN as -inf: `argmax` and `argsort` would let NaN win."""
@@ -33,8 +35,7 @@ class Tournament(AbstractSelection):
     size: int = eqx.field(static=True, default=3)  # entrants per tournament, at least 1
 
     def __check_init__(self):
-        if self.size < 1:
-            raise ValueError(f"size is {self.size}: a tournament needs at least 1 entrant")
+        require.at_least("size", self.size, 1)
 
     def __call__(self, fitness, n, *, key):
         fitness = rankable(fitness)

@@ -124,8 +124,8 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         Text(
             "Masking",
             [
-                "A masked cell is held at 0 before every step; the needed cells are the smallest set "
-                "that keeps the success over the 8 permutations with all others masked."
+                "A masked cell is held at 0 before every step; the needed cells are the smallest "
+                "set that keeps the success over the 8 permutations with all others masked."
             ],
         ),
     ]

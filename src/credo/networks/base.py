@@ -97,15 +97,3 @@ def draw(
 def to_action(output: Float[Array, "act *batch"], activation: str) -> Float[Array, "act *batch"]:
     """An output in [0, 1] (sigmoid) or [-1, 1] (tanh) as an action in [-1, 1]."""
     return 2.0 * output - 1.0 if activation == "sigmoid" else output
-
-
-def choose(name: str, value: str, allowed: dict | tuple) -> None:
-    """Raise unless `value` is one of `allowed`."""
-    if value not in allowed:
-        raise ValueError(f"{name} is {value!r}: it must be one of {', '.join(sorted(allowed))}")
-
-
-def at_least(name: str, value: float, minimum: float) -> None:
-    """Raise unless `value` is `minimum` or more."""
-    if value < minimum:
-        raise ValueError(f"{name} is {value}: it must be at least {minimum}")

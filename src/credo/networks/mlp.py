@@ -6,13 +6,12 @@ from typing import ClassVar, Literal
 import equinox as eqx
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from .. import require
 from .base import (
     ACTIVATIONS,
     INITIALIZERS,
     AbstractNetwork,
     AbstractPolicy,
-    at_least,
-    choose,
     draw,
     matvec,
     to_action,
@@ -29,11 +28,11 @@ class MLP(AbstractNetwork):
     initializer: str = eqx.field(static=True, default="normal")  # normal, fan_in or kaiming
 
     def __check_init__(self):
-        at_least("width", self.width, 1)
-        at_least("depth", self.depth, 1)
-        choose("activation", self.activation, ACTIVATIONS)
-        choose("output_activation", self.output_activation, ("sigmoid", "tanh"))
-        choose("initializer", self.initializer, INITIALIZERS)
+        require.at_least("width", self.width, 1)
+        require.at_least("depth", self.depth, 1)
+        require.choice("activation", self.activation, ACTIVATIONS)
+        require.choice("output_activation", self.output_activation, ("sigmoid", "tanh"))
+        require.choice("initializer", self.initializer, INITIALIZERS)
 
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> "MLPPolicy":
         sizes = (obs_size, *[self.width] * self.depth, action_size)

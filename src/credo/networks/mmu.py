@@ -21,13 +21,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from .. import require
 from .base import (
     ACTIVATIONS,
     INITIALIZERS,
     AbstractNetwork,
     AbstractPolicy,
-    at_least,
-    choose,
     draw,
     matvec,
     to_action,
@@ -48,19 +47,22 @@ class MMU(AbstractNetwork):
     output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
     start_memory: Literal["learned", "zero"] = eqx.field(static=True, default="learned")
     initializer: str = eqx.field(static=True, default="normal")  # normal, fan_in or kaiming
+    gates: Literal["drawn", "shut"] = eqx.field(static=True, default="drawn")
+    """`shut`: memory is written at inputs alone until training finds otherwise. Input weights are
+    drawn 4 times, output feedback 0.1 times as large, and the write gate's bias is lowered by 4."""
 
     def __check_init__(self):
-        at_least("hidden", self.hidden, 1)
-        at_least("memory", self.cells, 1)
-        if not 0.0 <= self.alpha <= 1.0:
-            raise ValueError(f"alpha is {self.alpha}: it must lie in [0, 1]")
-        choose("encoder", self.encoder, ("identity", "learned"))
-        choose("decoder", self.decoder, ("identity", "learned"))
+        require.at_least("hidden", self.hidden, 1)
+        require.at_least("memory", self.cells, 1)
+        require.within("alpha", self.alpha, 0, 1)
+        require.choice("encoder", self.encoder, ("identity", "learned"))
+        require.choice("decoder", self.decoder, ("identity", "learned"))
         for name in ("block_activation", "decoder_activation", "encoder_activation"):
-            choose(name, getattr(self, name), ACTIVATIONS)
-        choose("output_activation", self.output_activation, ("sigmoid", "tanh"))
-        choose("start_memory", self.start_memory, ("learned", "zero"))
-        choose("initializer", self.initializer, INITIALIZERS)
+            require.choice(name, getattr(self, name), ACTIVATIONS)
+        require.choice("output_activation", self.output_activation, ("sigmoid", "tanh"))
+        require.choice("gates", self.gates, ("drawn", "shut"))
+        require.choice("start_memory", self.start_memory, ("learned", "zero"))
+        require.choice("initializer", self.initializer, INITIALIZERS)
         if "identity" in (self.encoder, self.decoder) and self.cells != self.hidden:
             raise ValueError(
                 f"hidden is {self.hidden} and memory is {self.cells}: an identity encoder or "
@@ -85,7 +87,12 @@ class MMU(AbstractNetwork):
             shapes |= {"Z_f": (m, h), "b_f": (m,)}
         if self.start_memory == "learned":
             shapes |= {"m_0": (m,)}
-        return MMUPolicy(config=self, **draw(shapes, self.initializer, key=key))
+        weights = draw(shapes, self.initializer, key=key)
+        if self.gates == "shut":
+            scale = {"K": 4.0, "R": 0.1}
+            weights = {name: scale.get(name[0], 1.0) * w for name, w in weights.items()}
+            weights["b_w"] = weights["b_w"] - 4.0
+        return MMUPolicy(config=self, **weights)
 
 
 class MMUPolicy(AbstractPolicy):

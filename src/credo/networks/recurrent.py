@@ -11,13 +11,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from .. import require
 from .base import (
     ACTIVATIONS,
     INITIALIZERS,
     AbstractNetwork,
     AbstractPolicy,
-    at_least,
-    choose,
     draw,
     matvec,
     to_action,
@@ -35,10 +34,10 @@ class Recurrent(AbstractNetwork):
     initializer: str = eqx.field(static=True, default="normal")  # normal, fan_in or kaiming
 
     def __check_init__(self):
-        choose("cell", self.cell, GATES)
-        at_least("hidden", self.hidden, 1)
-        choose("output_activation", self.output_activation, ("sigmoid", "tanh"))
-        choose("initializer", self.initializer, INITIALIZERS)
+        require.choice("cell", self.cell, GATES)
+        require.at_least("hidden", self.hidden, 1)
+        require.choice("output_activation", self.output_activation, ("sigmoid", "tanh"))
+        require.choice("initializer", self.initializer, INITIALIZERS)
 
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> "RecurrentPolicy":
         h = self.hidden

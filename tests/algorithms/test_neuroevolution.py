@@ -1,0 +1,281 @@
+"""Neuroevolution: its bookkeeping, what it compiles, and that it learns."""
+
+import contextlib
+import dataclasses
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from credo import rollout, tree
+from credo.algorithms.neuroevolution import Neuroevolution, breed
+from credo.environments.probes import Copy
+from credo.environments.sequence_classification import SequenceClassification
+from credo.evolution.mutation import MatrixMutation
+from credo.networks.mmu import MMU
+
+TASK = SequenceClassification(depth=3, min_gap=1, max_gap=2)
+ALGORITHM = Neuroevolution(
+    TASK, MMU(hidden=3), population_size=20, elite_fraction=0.2, episodes=4, test_episodes=8
+)
+KEY = jax.random.key(0)
+ELITES = {16, 17, 18, 19}  # where fitness is the index
+BACKEND_COMPILE = "/jax/core/compile/backend_compile_duration"
+
+
+@pytest.fixture(scope="module")
+def start():
+    return ALGORITHM.init(key=jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def after(start):
+    return ALGORITHM.generation(start, key=jax.random.key(1))
+
+
+def same(a, b):
+    """Whether two genomes hold the same weights."""
+    leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(np.array_equal(x, y) for x, y in leaves)
+
+
+def fitness_of(state, key):
+    """What `generation` sees: the mean over its episodes."""
+    evaluation = rollout.evaluate(TASK, state.population, ALGORITHM.episodes, key=key)
+    return np.asarray(evaluation.returns["fitness"]).mean(axis=1)
+
+
+def test_elites_come_first_unchanged_and_the_champion_is_the_best(start, after):
+    state, metrics = after
+    evaluate_key = jax.random.split(jax.random.key(1), 3)[0]
+    fitness = fitness_of(start, evaluate_key)
+    best = np.argsort(-fitness, kind="stable")
+    assert ALGORITHM.elites == 4
+    for slot in range(4):
+        assert same(tree.take(state.population, slot), tree.take(start.population, best[slot]))
+    changed = [
+        not any(
+            same(tree.take(state.population, i), tree.take(start.population, j)) for j in range(20)
+        )
+        for i in range(4, 20)
+    ]
+    assert np.mean(changed) > 0.7
+    assert same(state.champion, tree.take(start.population, int(np.argmax(fitness))))
+    assert float(metrics["fitness_max"]) == pytest.approx(fitness.max(), rel=1e-5)
+    assert float(metrics["fitness_mean"]) == pytest.approx(fitness.mean(), rel=1e-5)
+
+
+def test_metrics_are_scalars_with_the_frames_of_the_population(start, after):
+    _, metrics = after
+    evaluate_key = jax.random.split(jax.random.key(1), 3)[0]
+    steps = rollout.evaluate(TASK, start.population, 4, key=evaluate_key).steps
+    assert int(metrics["frames"]) == int(np.sum(steps))
+    assert 20 * 4 * 5 <= int(metrics["frames"]) <= 20 * 4 * 7
+    assert int(metrics["fitness_nan"]) == 0
+    assert all(jnp.shape(value) == () for value in metrics.values())
+    assert 8 * float(metrics["champion_score"]) in range(9)
+
+
+def test_a_member_with_nan_fitness_is_counted_and_never_wins(start):
+    spoilt = tree.put(
+        start.population,
+        2,
+        jax.tree.map(lambda w: jnp.full_like(w, jnp.nan), tree.take(start.population, 2)),
+    )
+    state = eqx.tree_at(lambda s: s.population, start, spoilt)
+    bred, metrics = ALGORITHM.generation(state, key=jax.random.key(1))
+    assert int(metrics["fitness_nan"]) == 1
+    assert np.isfinite(metrics["fitness_max"])
+    weights = [
+        *jax.tree.leaves(tree.take(bred.population, jnp.arange(4))),
+        *jax.tree.leaves(bred.champion),
+    ]
+    assert all(np.isfinite(w).all() for w in weights)
+    again = jnp.mean(rollout.evaluate(TASK, spoilt, 4, key=jax.random.key(3)).returns["fitness"], 1)
+    assert np.flatnonzero(np.isnan(again)).tolist() == [2]
+
+
+def test_the_same_seed_gives_the_same_weights(start, after):
+    again, _ = ALGORITHM.generation(ALGORITHM.init(key=jax.random.key(0)), key=jax.random.key(1))
+    other, _ = ALGORITHM.generation(start, key=jax.random.key(2))
+    assert same(again, after[0])
+    assert not same(other, after[0])
+
+
+QUIET = dataclasses.replace(ALGORITHM, mutation=MatrixMutation(probability=0.0))
+
+
+def ancestors(bred, start):
+    """With mutation off: the member that each bred genome is a copy of."""
+    members = [tree.take(start.population, j) for j in range(20)]
+    return [next(j for j in range(20) if same(tree.take(bred, i), members[j])) for i in range(20)]
+
+
+def test_offspring_come_from_the_selected(start):
+    """With mutation off every offspring is a member, the fitter the more often."""
+    parents = ancestors(breed(QUIET, start.population, jnp.arange(20.0), key=KEY), start)
+    assert parents[:4] == [19, 18, 17, 16]
+    assert np.mean(parents[4:]) > 12  # the best of three of 0..19: 14.7 on average
+
+
+def row_parents(child, population):
+    """For each row of each matrix, the members that have it."""
+    for rows, all_rows in zip(jax.tree.leaves(child), jax.tree.leaves(population), strict=True):
+        for r, row in enumerate(np.asarray(rows)):
+            yield {
+                j for j, member in enumerate(np.asarray(all_rows)) if np.array_equal(member[r], row)
+            }
+
+
+def test_crossover_mixes_an_elite_into_the_selected(start):
+    crossing = dataclasses.replace(QUIET, crossover_probability=1.0)
+    bred = breed(crossing, start.population, jnp.arange(20.0), key=KEY)
+    mixed = 0
+    for i in range(4, 20):
+        parents = list(row_parents(tree.take(bred, i), start.population))
+        assert all(parents)  # every row is somebody's
+        everyone = set().union(*parents)
+        assert everyone & ELITES
+        assert len(everyone) <= 2
+        mixed += len(everyone) == 2
+    assert mixed >= 8
+
+
+def test_as_coded_is_the_authors_program_and_can_be_overridden():
+    coded = Neuroevolution.as_coded(TASK, MMU(hidden=3))
+    assert coded.cross_repeated
+    assert (coded.population_size, coded.elites, coded.episodes) == (100, 10, 10)
+    mutation = coded.mutation
+    assert isinstance(mutation, MatrixMutation)
+    assert (mutation.gate, mutation.probability) == ("genome", 0.9)
+    assert (mutation.fraction, mutation.up_to_fraction, mutation.strength) == (0.2, True, 0.2)
+    assert (mutation.super_probability, mutation.super_strength) == (0.05, 10.0)
+    assert coded.selection.size == 3
+    smaller = Neuroevolution.as_coded(TASK, MMU(hidden=3), population_size=10, cross_repeated=False)
+    assert (smaller.population_size, smaller.cross_repeated) == (10, False)
+
+
+def test_repeated_survivors_are_crossed(start):
+    fitness = jnp.arange(20.0)
+    parents = ancestors(breed(QUIET, start.population, fitness, key=KEY), start)
+    crossing = dataclasses.replace(QUIET, cross_repeated=True)
+    bred = breed(crossing, start.population, fitness, key=KEY)
+    changed = 0
+    for i in range(4, 20):
+        child, parent = tree.take(bred, i), tree.take(start.population, parents[i])
+        if parents[i] not in parents[4:i]:
+            assert same(child, parent)
+        else:
+            assert set().union(*row_parents(child, start.population)) <= {parents[i], *ELITES}
+            changed += not same(child, parent)  # an elite may be crossed with itself
+    assert changed >= 4
+
+
+def test_extinction_spares_the_elites(start):
+    doomed = dataclasses.replace(
+        ALGORITHM,
+        extinction=dataclasses.replace(ALGORITHM.extinction, probability=1.0, magnitude=1.0),
+    )
+    bred = breed(doomed, start.population, jnp.arange(20.0), key=KEY)
+    assert all(same(tree.take(bred, i), tree.take(start.population, 19 - i)) for i in range(4))
+    # The others are fresh: their weights are standard normal again, whoever was selected.
+    fresh = np.asarray(bred.N_i[4:])
+    assert not np.isin(fresh, np.asarray(start.population.N_i)).any()
+    assert fresh.std() == pytest.approx(1.0, rel=0.2)
+
+
+@contextlib.contextmanager
+def compilations():
+    """A list that grows by one for every program that is compiled or loaded meanwhile."""
+    events = []
+
+    def listen(event, duration, **details):
+        if event == BACKEND_COMPILE:
+            events.append(details)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield events
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_nothing_compiles_after_the_first_generation(start):
+    root = jax.random.key(5)
+    with compilations() as events:
+        jax.jit(lambda x: x + 17.5)(jnp.float32(1.0))
+    assert events  # the count sees a compilation
+    state, _ = ALGORITHM.generation(start, key=jax.random.fold_in(root, 0))
+    with compilations() as events:
+        for g in range(1, 4):
+            state, _ = ALGORITHM.generation(state, key=jax.random.fold_in(root, g))
+        jax.block_until_ready(state)
+    assert events == []
+
+
+def test_a_new_hyper_parameter_compiles_nothing(start):
+    state, _ = ALGORITHM.generation(start, key=jax.random.key(6))
+    stronger = dataclasses.replace(
+        ALGORITHM,
+        mutation=MatrixMutation(strength=0.5, fraction=0.3),
+        crossover_probability=0.1,
+        extinction=dataclasses.replace(ALGORITHM.extinction, probability=0.01),
+    )
+    with compilations() as events:
+        changed, _ = jax.block_until_ready(stronger.generation(state, key=jax.random.key(7)))
+    assert events == []
+    plain, _ = ALGORITHM.generation(state, key=jax.random.key(7))
+    assert not same(changed.population, plain.population)  # and it has an effect
+
+
+def success_by_enumeration(answers):
+    """Share of all depth-3 sequences for which `answers(signals)` is right at every signal."""
+    solved = []
+    for signals in itertools.product([-1, 1], repeat=3):
+        right = [1 if total >= 0 else -1 for total in itertools.accumulate(signals)]
+        solved.append(right == answers(signals))
+    return np.mean(solved)
+
+
+def test_it_learns_to_count_to_three():
+    floors = (
+        success_by_enumeration(lambda s: [s[0]] * 3),
+        success_by_enumeration(list),
+        success_by_enumeration(lambda s: [1, 1, 1]),
+    )
+    assert max(floors) == 0.625
+    algorithm = Neuroevolution.as_coded(TASK, MMU(hidden=5), population_size=50)
+    state = algorithm.init(key=KEY)
+    for g in range(300):
+        state, metrics = algorithm.generation(state, key=jax.random.fold_in(KEY, g))
+        if metrics["champion_score"] == 1.0:  # of 50 sequences
+            break
+    champion = jax.tree.map(lambda w: w[None], state.champion)
+    success = rollout.evaluate(TASK, champion, 200, key=jax.random.key(2)).returns["success"]
+    assert float(jnp.mean(success)) > 0.9
+
+
+def test_it_names_the_signal_it_maximises_and_the_one_it_reports(start, after):
+    swapped = dataclasses.replace(ALGORITHM, fitness="success", score="fitness")
+    _, metrics = swapped.generation(start, key=jax.random.key(1))
+    assert 4 * float(metrics["fitness_max"]) in range(5)
+    assert float(metrics["fitness_mean"]) != pytest.approx(float(after[1]["fitness_mean"]))
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"population_size": 1}, "population_size is 1"),
+        ({"elite_fraction": 1.0}, "elite_fraction is 1.0"),
+        ({"episodes": 0}, "episodes is 0"),
+        ({"test_episodes": 0}, "test_episodes is 0"),
+        ({"fitness": "speed"}, "no reward signal 'speed': this task has reward"),
+        ({"score": "speed"}, "no reward signal 'speed'"),
+    ],
+)
+def test_impossible_settings_are_refused(fields, told):
+    with pytest.raises(ValueError, match=told):
+        Neuroevolution(Copy(), MMU(hidden=2), **fields)
