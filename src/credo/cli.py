@@ -46,7 +46,8 @@ EXPERIMENTS = {
     "fig-3.7": "write heat map, depth 21",
     "alg-3.3": "the pseudo-algorithm a champion runs",
     "fig-3.9a": "success by depth, sequence recall",
-    "fig-3.10": "recall in corridors of 0..101 steps",
+    "fig-3.10": "recall in corridors of 1..101 steps",
+    "ablation-3.4a": "our settings less one ingredient, 21-deep",
 }
 COMMANDS = {
     "list": "tasks, algorithms, networks and experiments",
@@ -171,8 +172,8 @@ def _train(argv: list[str]) -> None:
         if preset not in presets:
             fail(f"no preset {preset!r} of {names[0]}", preset, presets)
         build = presets[preset]
-    default = build(env, _load(path)(**fields))
-    algorithm, options = _parse(f"credo train {names[0]} {names[1]}", default, TrainOptions, argv)
+    prog = f"credo train {names[0]} {names[1]}"
+    algorithm, options = _configured(prog, build, env, _load(path)(**fields), argv)
     seconds = _seconds(options.wall_clock)
 
     from .runs import loop
@@ -195,6 +196,13 @@ def _train(argv: list[str]) -> None:
         _guarded(lambda: start(options.seed, options.path))
     else:
         _guarded(lambda: _train_seeds(algorithm, options, seconds))
+
+
+def _configured(prog: str, build: Any, env: Any, network: Any, argv: list[str]) -> list:
+    """The algorithm that `build` makes of a task and network with these flags, and the options."""
+    first, _ = _parse(prog, build(env, network), TrainOptions, argv)
+    # What a preset derives from the task must follow from the one asked for, not its defaults.
+    return _parse(prog, build(first.env, first.network), TrainOptions, argv)
 
 
 def _train_seeds(algorithm: Any, options: TrainOptions, seconds: float | None) -> None:
@@ -351,12 +359,16 @@ def _task(name: str) -> Any:
     """A task by its name or as `package.module:Class`, with its defaults."""
     if name in TASKS:
         return _load(TASKS[name][0])()
-    if ":" not in name:
+    if not re.fullmatch(r"\w+(\.\w+)*:\w+", name):
         fail(f"no task {name!r}; one of your own is written package.module:Class", name, TASKS)
     try:
         cls = _load(name)
     except (ImportError, AttributeError) as error:
         fail(f"cannot import {name!r}: {error}. Start credo in the folder of its file")
+    from .environments.base import AbstractEnvironment
+
+    if not (isinstance(cls, type) and issubclass(cls, AbstractEnvironment)):
+        fail(f"{name} is no task: derive it from credo.AbstractEnvironment")
     try:
         return cls()
     except TypeError as error:
@@ -470,7 +482,7 @@ def _guarded(go: Any) -> None:
     except Interrupted as stop:
         print(f"credo: {stop}", file=sys.stderr)
         raise SystemExit(stop.code) from None
-    except (RunError, ConfigError, CheckpointError, RunLocked, ValueError) as error:
+    except (RunError, ConfigError, CheckpointError, RunLocked, ValueError, OSError) as error:
         print(f"credo: {error}", file=sys.stderr)
         raise SystemExit(1) from None
     except KeyboardInterrupt:

@@ -14,6 +14,7 @@ from credo import rollout, tree
 from credo.algorithms.neuroevolution import Neuroevolution, breed
 from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
+from credo.evolution.curriculum import Curriculum
 from credo.evolution.mutation import MatrixMutation
 from credo.networks.mmu import MMU
 
@@ -154,6 +155,7 @@ def test_as_coded_is_the_authors_program_and_can_be_overridden():
     assert (mutation.fraction, mutation.up_to_fraction, mutation.strength) == (0.2, True, 0.2)
     assert (mutation.super_probability, mutation.super_strength) == (0.05, 10.0)
     assert coded.selection.size == 3
+    assert (coded.elite_memory, coded.curriculum, coded.fitness) == (1, None, ())
     smaller = Neuroevolution.as_coded(TASK, MMU(hidden=3), population_size=10, cross_repeated=False)
     assert (smaller.population_size, smaller.cross_repeated) == (10, False)
 
@@ -265,6 +267,106 @@ def test_it_names_the_signal_it_maximises_and_the_one_it_reports(start, after):
     assert float(metrics["fitness_mean"]) != pytest.approx(float(after[1]["fitness_mean"]))
 
 
+def test_fitness_is_a_signal_or_the_sum_of_several(start, after):
+    keys = jax.random.split(jax.random.key(1), 3)
+    returns = rollout.evaluate(TASK, start.population, 4, key=keys[0]).returns
+    several = dataclasses.replace(ALGORITHM, fitness=("accuracy", "success"))
+    _, metrics = several.generation(start, key=jax.random.key(1))
+    total = np.mean(np.asarray(returns["accuracy"]) + np.asarray(returns["success"]), axis=1)
+    assert float(metrics["fitness_max"]) == pytest.approx(total.max(), rel=1e-5)
+    assert float(metrics["fitness_mean"]) == pytest.approx(total.mean(), rel=1e-5)
+    assert dataclasses.replace(ALGORITHM, fitness="success").fitness == ("success",)
+    assert ALGORITHM.fitness == ()
+    assert dataclasses.replace(ALGORITHM, fitness="fitness").generation(
+        start, key=jax.random.key(1)
+    )[1]["fitness_max"] == pytest.approx(float(after[1]["fitness_max"]))
+
+
+def test_without_memory_an_elite_is_judged_by_its_last_generation(after):
+    state, _ = after
+    assert np.asarray(state.age).tolist() == [0] * 20
+    _, metrics = ALGORITHM.generation(state, key=jax.random.key(2))
+    fitness = fitness_of(state, jax.random.split(jax.random.key(2), 3)[0])
+    assert float(metrics["fitness_max"]) == pytest.approx(fitness.max(), rel=1e-5)
+
+
+def test_elite_memory_averages_the_generations_of_an_elite(start):
+    """Two generations back and this one: a mean of at most three, kept by hand beside it."""
+    algorithm = dataclasses.replace(ALGORITHM, elite_memory=3)
+    state, record, age = start, np.zeros(20), np.zeros(20, int)
+    full = 0
+    for g in range(8):
+        key = jax.random.key(g)
+        now = fitness_of(state, jax.random.split(key, 3)[0])
+        fitness = (record * age + now) / (age + 1)
+        order = np.argsort(-fitness, kind="stable")
+        before = state
+        state, metrics = algorithm.generation(state, key=key)
+        assert float(metrics["fitness_max"]) == pytest.approx(fitness.max(), rel=1e-4)
+        assert float(metrics["fitness_mean"]) == pytest.approx(now.mean(), rel=1e-4)
+        assert same(state.champion, tree.take(before.population, order[0]))
+        elite = np.arange(20) < 4
+        record = np.where(elite, fitness[order], 0.0)
+        full += np.sum(age[order][:4] == 2)
+        age = np.where(elite, np.minimum(age[order] + 1, 2), 0)
+        np.testing.assert_allclose(state.record, record, rtol=1e-4)
+        np.testing.assert_array_equal(state.age, age)
+    assert full > 0  # an elite was kept whose memory was full
+
+
+def levelled(**fields):
+    return dataclasses.replace(ALGORITHM, curriculum=Curriculum(start=1, **fields))
+
+
+def test_the_level_rises_only_when_the_best_member_reaches_the_threshold(start):
+    algorithm = levelled(threshold=0.0)
+    state = algorithm.init(key=jax.random.key(0))
+    assert int(state.level) == 1
+    assert same(state.population, start.population)
+    key = jax.random.key(1)
+    task = algorithm.curriculum.task(TASK, state.level)
+    keys = jax.random.split(key, 3)
+    returns = rollout.evaluate(task, state.population, 4, key=keys[0]).returns
+    best = int(np.argmax(np.asarray(returns["fitness"]).mean(axis=1)))
+    success = float(np.asarray(returns["success"])[best].mean())
+    assert 0 < success < 0.99
+    for threshold, level in ((0.0, 2), (success, 2), (success - 0.01, 2), (success + 0.01, 1)):
+        after, metrics = levelled(threshold=threshold).generation(state, key=key)
+        assert int(after.level) == level
+        assert int(metrics["level"]) == 1  # the level that was played
+        assert int(metrics["frames"]) == 20 * 4  # one question, at the first step
+    population, champion = after.population, after.champion
+    hopeless = eqx.tree_at(
+        lambda s: s.population, state, jax.tree.map(lambda w: w * jnp.nan, state.population)
+    )
+    after, _ = levelled(threshold=0.01).generation(hopeless, key=key)
+    assert int(after.level) == 1
+    assert not same(population, state.population)
+    assert same(champion, tree.take(state.population, best))
+
+
+def test_a_level_past_the_last_question_is_the_whole_task(start, after):
+    algorithm = levelled(threshold=0.9)
+    state = eqx.tree_at(lambda s: s.level, algorithm.init(key=jax.random.key(0)), jnp.int32(99))
+    bred, metrics = algorithm.generation(state, key=jax.random.key(1))
+    assert same(bred.population, after[0].population)
+    assert int(metrics["frames"]) == int(after[1]["frames"])
+
+
+def test_a_curriculum_may_train_on_a_longer_task_and_tests_on_the_algorithms_own():
+    longer = SequenceClassification(depth=5, min_gap=2, max_gap=2)
+    algorithm = levelled(whole=longer)
+    state = eqx.tree_at(lambda s: s.level, algorithm.init(key=jax.random.key(0)), jnp.int32(5))
+    after, metrics = algorithm.generation(state, key=jax.random.key(1))
+    assert int(metrics["frames"]) == 20 * 4 * (5 + 4 * 2)
+    test_key = jax.random.split(jax.random.key(1), 3)[2]
+    own = rollout.evaluate(TASK, tree.stack(after.champion), 8, key=test_key)
+    assert own.steps.max() <= TASK.max_steps
+    assert float(metrics["champion_score"]) == pytest.approx(
+        float(jnp.mean(own.returns["success"]))
+    )
+
+
 @pytest.mark.parametrize(
     ("fields", "told"),
     [
@@ -272,6 +374,9 @@ def test_it_names_the_signal_it_maximises_and_the_one_it_reports(start, after):
         ({"elite_fraction": 1.0}, "elite_fraction is 1.0"),
         ({"episodes": 0}, "episodes is 0"),
         ({"test_episodes": 0}, "test_episodes is 0"),
+        ({"elite_memory": 0}, "elite_memory is 0"),
+        ({"crossover_probability": 1.5}, "crossover_probability is 1.5"),
+        ({"fitness": ("reward", "speed")}, "no reward signal 'speed'"),
         ({"fitness": "speed"}, "no reward signal 'speed': this task has reward"),
         ({"score": "speed"}, "no reward signal 'speed'"),
     ],

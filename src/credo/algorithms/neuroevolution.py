@@ -10,6 +10,7 @@ Departures from the printed box:
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Self
 
 import equinox as eqx
@@ -20,14 +21,28 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from .. import require, tree
 from ..compilation import jit
 from ..environments.base import AbstractEnvironment, AbstractSequenceTask
+from ..environments.sequence_classification import SequenceClassification
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.curriculum import Curriculum
 from ..evolution.extinction import Extinction
 from ..evolution.mutation import AbstractMutation, MatrixMutation
+from ..evolution.parsimony import Parsimony
 from ..evolution.selection import AbstractSelection, Tournament, rankable, ranking, repeated
 from ..networks.base import AbstractNetwork
+from ..networks.mmu import MMU
 from ..rollout import evaluate
 from ..types import Evaluation, Metrics
+
+
+def _author_mutation() -> MatrixMutation:
+    return MatrixMutation(
+        gate="genome",
+        fraction=0.2,
+        up_to_fraction=True,
+        strength=0.2,
+        super_probability=0.05,
+        limit=1e12,
+    )
 
 
 def _names(signals: str | tuple[str, ...]) -> tuple[str, ...]:
@@ -61,6 +76,7 @@ class Neuroevolution(eqx.Module):
     elite_memory: int = eqx.field(static=True, default=1)
     """Generations over which the fitness of an elite is averaged; 1: the last alone."""
     curriculum: Curriculum | None = None  # None: the whole task from the start
+    parsimony: Parsimony | None = None  # bonus for simple genomes, times their score
     fitness: tuple[str, ...] = eqx.field(static=True, default=(), converter=_names)
     """Reward signals whose sum is the fitness; none: the task's first."""
     score: str | None = eqx.field(static=True, default=None)  # signal; None: the task's last
@@ -89,24 +105,30 @@ class Neuroevolution(eqx.Module):
     def as_coded(cls, env: AbstractEnvironment, network: AbstractNetwork, **overrides) -> Self:
         """The author's program of 2017: one gate per genome, up to 20 % of each matrix hit with
         20 % noise, 5 % of the hits super, repeated survivors replaced by row crossover."""
-        mutation = MatrixMutation(
-            gate="genome",
-            fraction=0.2,
-            up_to_fraction=True,
-            strength=0.2,
-            super_probability=0.05,
-            limit=1e12,
+        return cls(
+            env, network, **{"mutation": _author_mutation(), "cross_repeated": True} | overrides
         )
-        return cls(env, network, **{"mutation": mutation, "cross_repeated": True} | overrides)
 
     @classmethod
     def ours(cls, env: AbstractEnvironment, network: AbstractNetwork, **overrides) -> Self:
-        """The best settings found (docs/neuroevolution.md has their ablation): the author's
-        operators, a curriculum, the share of right answers as fitness, and elites that are judged
-        by several generations."""
-        settings: dict[str, Any] = {"elite_memory": 6}
+        """The best settings found, with their ablation in docs/neuroevolution.md: the author's
+        operators with weights clipped to ±40 and a tenth of the hits erasing; elites judged by
+        several generations. On a sequence task also a curriculum, the share of right answers as
+        fitness, and parsimony; on Sequence Classification the curriculum's signals persist. An
+        MMU starts with saturated gates."""
+        limit = 40.0
+        mutation = replace(_author_mutation(), limit=limit, reset_probability=0.1, reset_std=0.0)
+        settings: dict[str, Any] = {"elite_memory": 6, "mutation": mutation}
         if isinstance(env, AbstractSequenceTask):
-            settings |= {"curriculum": Curriculum(), "fitness": ("accuracy", "success")}
+            persistent = isinstance(env, SequenceClassification)
+            whole = replace(env, persistence=0.8) if persistent else None
+            settings |= {
+                "curriculum": Curriculum(whole=whole),
+                "parsimony": Parsimony(limit=limit),
+                "fitness": ("accuracy", "success"),
+            }
+        if isinstance(network, MMU):
+            network = replace(network, start_weights="saturated")
         return cls.as_coded(env, network, **settings | overrides)
 
     @classmethod
@@ -176,6 +198,9 @@ def assess(
     signals = algorithm.fitness or algorithm.env.signals[:1]
     total = jnp.stack([evaluation.returns[name] for name in signals]).sum(axis=0)
     returns = jnp.mean(total, axis=1)
+    if algorithm.parsimony:
+        score = evaluation.returns[algorithm.score or algorithm.env.signals[-1]]
+        returns = returns + algorithm.parsimony(state.population) * jnp.mean(score, axis=1)
     age = state.age.astype(jnp.float32)
     return (state.record * age + returns) / (age + 1.0), returns
 

@@ -42,12 +42,17 @@ class SequenceClassification(AbstractSequenceTask):
     ties: Literal["positive", "free"] = eqx.field(static=True, default="positive")
     """The right answer at a running sum of 0: +1, or anything."""
 
+    persistence: float = eqx.field(static=True, default=0.5)
+    """Chance that a signal repeats the one before; ½: independent, as in the dissertation. More
+    makes running sums larger, for training."""
+
     def __check_init__(self):
         require.at_least("depth", self.depth, 1)
         if not 0 <= self.min_gap <= self.max_gap:
             raise ValueError(
                 f"gaps of {self.min_gap}..{self.max_gap} zeros: needs 0 <= min_gap <= max_gap"
             )
+        require.within("persistence", self.persistence, 0, 1)
         require.choice("ties", self.ties, ("positive", "free"))
 
     @property
@@ -60,7 +65,13 @@ class SequenceClassification(AbstractSequenceTask):
 
     def sample(self, *, key: PRNGKeyArray) -> Sequence:
         signal_key, gap_key = jax.random.split(key)
-        signals = jax.random.rademacher(signal_key, (self.depth,), jnp.float32)
+        if self.persistence == 0.5:
+            signals = jax.random.rademacher(signal_key, (self.depth,), jnp.float32)
+        else:
+            repeats = jax.random.bernoulli(signal_key, self.persistence, (self.depth,))
+            first = jax.random.rademacher(jax.random.fold_in(signal_key, 1), (), jnp.float32)
+            flips = jnp.where(repeats, 1.0, -1.0).at[0].set(first)
+            signals = jnp.cumprod(flips)
         gaps = jax.random.randint(gap_key, (self.depth,), self.min_gap, self.max_gap + 1)
         return self.lay_out(signals, gaps)
 

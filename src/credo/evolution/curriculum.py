@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .. import require
 from ..environments.base import AbstractEnvironment, AbstractSequenceTask
 from ..environments.wrappers import Shortened
 

@@ -22,6 +22,7 @@ MODULES = {
     "alg-3.3": "alg_3_3",
     "fig-3.9a": "fig_3_9a",
     "fig-3.10": "fig_3_10",
+    "ablation-3.4a": "ablation_3_4a",
 }
 
 

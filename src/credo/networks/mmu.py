@@ -47,9 +47,11 @@ class MMU(AbstractNetwork):
     output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
     start_memory: Literal["learned", "zero"] = eqx.field(static=True, default="learned")
     initializer: str = eqx.field(static=True, default="normal")  # normal, fan_in or kaiming
-    gates: Literal["drawn", "shut"] = eqx.field(static=True, default="drawn")
-    """`shut`: memory is written at inputs alone until training finds otherwise. Input weights are
-    drawn 4 times, output feedback 0.1 times as large, and the write gate's bias is lowered by 4."""
+    start_weights: Literal["drawn", "saturated"] = eqx.field(static=True, default="drawn")
+    """`saturated`: at first every gate is open or shut by the input alone, and memory is read but
+    not written at distractors. Input weights are drawn 30 times as large, output weights 75 times
+    and clipped to ±40, output feedback 0.1 times; the write gate's bias is lowered and the read
+    gate's raised by 20."""
 
     def __check_init__(self):
         require.at_least("hidden", self.hidden, 1)
@@ -60,7 +62,7 @@ class MMU(AbstractNetwork):
         for name in ("block_activation", "decoder_activation", "encoder_activation"):
             require.choice(name, getattr(self, name), ACTIVATIONS)
         require.choice("output_activation", self.output_activation, ("sigmoid", "tanh"))
-        require.choice("gates", self.gates, ("drawn", "shut"))
+        require.choice("start_weights", self.start_weights, ("drawn", "saturated"))
         require.choice("start_memory", self.start_memory, ("learned", "zero"))
         require.choice("initializer", self.initializer, INITIALIZERS)
         if "identity" in (self.encoder, self.decoder) and self.cells != self.hidden:
@@ -88,10 +90,11 @@ class MMU(AbstractNetwork):
         if self.start_memory == "learned":
             shapes |= {"m_0": (m,)}
         weights = draw(shapes, self.initializer, key=key)
-        if self.gates == "shut":
-            scale = {"K": 4.0, "R": 0.1}
+        if self.start_weights == "saturated":
+            scale = {"K": 30.0, "R": 0.1, "Z": 75.0}
             weights = {name: scale.get(name[0], 1.0) * w for name, w in weights.items()}
-            weights["b_w"] = weights["b_w"] - 4.0
+            weights["Z_y"] = jnp.clip(weights["Z_y"], -40.0, 40.0)
+            weights |= {"b_w": weights["b_w"] - 20.0, "b_r": weights["b_r"] + 20.0}
         return MMUPolicy(config=self, **weights)
 
 

@@ -36,8 +36,8 @@ def describe(run: Run, task: Any, episodes: int, seed: int) -> Iterator[str]:
         return
     evaluation = evaluate(task, policies, episodes, key=key)
     yield f"{run.path}: {episodes} fresh episodes"
-    for name, returns in evaluation.returns.items():
-        values = np.asarray(returns[0], np.float64)
+    for name in task.signals:
+        values = np.asarray(evaluation.returns[name][0], np.float64)
         error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
         yield f"  {name:<16} {values.mean():.4g} ± {error:.2g}"
     yield f"  steps            {np.mean(evaluation.steps):.1f}"

@@ -1,6 +1,7 @@
 """Many runs, one process per core: on two cores, two single-threaded runs beat one that uses
 both. What is finished is not run again; what was stopped goes on."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -87,19 +88,12 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
     def work(core: int) -> None:
         nonlocal done
         process = _start(core)
-        assert process.stdin is not None
-        assert process.stdout is not None
         while not signals.received:
             with guard:
                 job = next(queue, None)
             if job is None:
                 break
-            try:
-                process.stdin.write(job.message() + "\n")
-                process.stdin.flush()
-                answer = json.loads(process.stdout.readline() or '{"error": "its process ended"}')
-            except (OSError, json.JSONDecodeError) as error:
-                answer = {"error": f"its process ended ({error})"}
+            answer = _ask(process, job)
             with guard:
                 if "error" in answer:
                     failures.append(f"{job.path}: {answer['error']}")
@@ -113,11 +107,9 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
                         flush=True,
                     )
             if process.poll() is not None:
+                _end(process)
                 process = _start(core)
-                assert process.stdin is not None
-                assert process.stdout is not None
-        process.stdin.close()
-        process.wait()
+        _end(process)
 
     with Signals() as signals, bar:
         threads = [
@@ -154,3 +146,25 @@ def _start(core: int) -> subprocess.Popen:
     )
     _processes.append(process)
     return process
+
+
+def _ask(process: subprocess.Popen, job: Job) -> dict[str, Any]:
+    """The answer of a worker; without one its process has ended when this returns."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        process.stdin.write(job.message() + "\n")
+        process.stdin.flush()
+        return json.loads(process.stdout.readline())
+    except (OSError, json.JSONDecodeError):
+        process.kill()  # else the next job might still be given to it
+        return {"error": f"its process ended with exit code {process.wait()}"}
+
+
+def _end(process: subprocess.Popen) -> None:
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.close()
+    process.wait()
+    process.stdout.close()

@@ -38,17 +38,24 @@ class Log:
                     if name != "generation":
                         self.events.add_scalar(name, value, int(row["generation"]))
 
+    def sync(self):
+        """Put the rows on the disk: a checkpoint must never be ahead of them."""
+        for name in ("metrics.csv", "timing.csv"):
+            if (self.directory / name).exists():
+                with (self.directory / name).open("rb") as file:
+                    os.fsync(file.fileno())
+
     def close(self):
         if self.events is not None:
             self.events.close()
 
 
 def read(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """The columns of a metrics file; empty if there is none."""
+    """The columns of a metrics file; empty if there is none. A half-written line is left out."""
     if not path.exists():
         return {}
     with path.open(newline="") as file:
-        rows = list(csv.reader(file))
+        rows = list(csv.reader(line for line in file if line.endswith("\n")))
     if not rows:
         return {}
     columns = zip(*rows[1:], strict=True) if rows[1:] else ([] for _ in rows[0])
@@ -65,11 +72,15 @@ def _text(value: float | int) -> str:
 
 def _append(path: pathlib.Path, rows: Sequence[dict[str, float | int]]):
     new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        if new:
-            writer.writerow(rows[0])
-        writer.writerows([_text(value) for value in row.values()] for row in rows)
+    try:
+        with path.open("a", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            if new:
+                writer.writerow(rows[0])
+            writer.writerows([_text(value) for value in row.values()] for row in rows)
+    except OSError as error:
+        help = f"{error.strerror}: free some space, then resume; checkpoints are intact"
+        raise OSError(error.errno, help, str(path)) from error
 
 
 def _cut(path: pathlib.Path, generation: int):

@@ -240,12 +240,14 @@ def _train(run, algorithm, wall_clock, *, checkpoint_every, keep, tensorboard, p
                 ended = any(answers)
             ended = ended or (wall_clock is not None and now - began >= wall_clock)
             if now - last_save >= checkpoint_every:
+                journal.sync()
                 _save(run, algorithm, generation, state, frames, keep)
                 last_save = now
             # The first dispatch compiles; from the second on, its length follows the clock.
             # How many generations one dispatch holds is data and changes no result.
             chunk = 2 if chunk == 1 else int(np.clip(n * DISPATCH / seconds, 1, CHUNK))
         journal.close()
+        journal.sync()
         _save(run, algorithm, generation, state, frames, keep)
     if signals.received and generation < budget:
         raise Interrupted(

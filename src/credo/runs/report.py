@@ -63,10 +63,15 @@ def _labels(trees: list[dict[str, Any]]) -> list[str]:
     flat = [config.flatten(tree) for tree in trees]
     keys = dict.fromkeys(key for tree in flat for key in tree)
     differing = [key for key in keys if len({str(tree.get(key)) for tree in flat}) > 1]
-    return [
-        f"{name}: " + ", ".join(f"{key} {tree[key]}" for key in differing[:3] if key in tree)
-        for name, tree in zip(names, flat, strict=True)
-    ]
+
+    def named(keys: list[str]) -> list[str]:
+        return [
+            f"{name}: " + ", ".join(f"{key} {tree[key]}" for key in keys if key in tree)
+            for name, tree in zip(names, flat, strict=True)
+        ]
+
+    short = named(differing[:3])
+    return short if len(set(short)) == len(short) else named(differing)
 
 
 def _figure(runs: dict[str, list[Run]], metric: str, title: str) -> Figure:

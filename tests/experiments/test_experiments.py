@@ -1,0 +1,185 @@
+"""Every experiment, on tiny runs: its numbers are plain, its page renders, a rerun repeats it."""
+
+import importlib
+import json
+import pathlib
+from html import escape
+
+import jax
+import numpy as np
+import pytest
+
+from credo import cli
+from credo.algorithms.neuroevolution import Neuroevolution
+from credo.environments.sequence_classification import SequenceClassification
+from credo.environments.sequence_recall import SequenceRecall
+from credo.experiments import base, chapter3, fig_3_4a
+from credo.networks.mmu import MMU
+from credo.runs import executor, page
+from credo.runs.loop import Run, train
+
+BUDGETS = ("smoke", "quick", "full")
+SIZES = {"population_size": 10, "episodes": 4, "test_episodes": 6}
+SEEDS, GENERATIONS = 2, 12
+TINY = {
+    "classification 2-deep as coded": Neuroevolution.as_coded(
+        SequenceClassification(depth=2, min_gap=1, max_gap=2), MMU(hidden=5), **SIZES
+    ),
+    "classification 2-deep ours": Neuroevolution.ours(
+        SequenceClassification(depth=2, min_gap=1, max_gap=2), MMU(hidden=5), **SIZES
+    ),
+    "recall 1-deep ours": Neuroevolution.ours(
+        SequenceRecall(depth=1, min_corridor=1, max_corridor=2), MMU(hidden=5), **SIZES
+    ),
+}
+
+
+def experiment(name):
+    return importlib.import_module(f"credo.experiments.{base.MODULES[name]}")
+
+
+@pytest.fixture(scope="session")
+def runs(tmp_path_factory):
+    """Two short runs of each cell."""
+    folder = tmp_path_factory.mktemp("cells")
+    trained = {
+        name: [
+            train(
+                algorithm,
+                generations=GENERATIONS,
+                seed=seed,
+                path=folder / name / str(seed),
+                tensorboard=False,
+                progress=False,
+            )
+            for seed in range(SEEDS)
+        ]
+        for name, algorithm in TINY.items()
+    }
+    # A run caches only programs that took a while to compile; tests cache them all.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    return trained
+
+
+def cells_of(name: str, runs: dict[str, list[Run]]) -> dict[str, list[Run]]:
+    """As many of the runs as the experiment wants, of its own task."""
+    wanted = experiment(name).cells("smoke")
+    task = wanted[0].name.split()[0]
+    chosen = {cell: group for cell, group in runs.items() if cell.startswith(task)}
+    return dict(list(chosen.items())[-len(wanted) :])
+
+
+def test_the_command_line_lists_what_there_is():
+    assert list(cli.EXPERIMENTS) == list(base.MODULES)
+    folder = pathlib.Path(base.__file__).parent
+    modules = {path.stem for path in folder.glob("*_[0-9]*.py")}
+    assert modules == set(base.MODULES.values())
+
+
+@pytest.mark.parametrize("budget", BUDGETS)
+@pytest.mark.parametrize("name", base.MODULES)
+def test_cells_are_named_once_and_have_runs(name, budget):
+    cells = experiment(name).cells(budget)
+    assert len(cells) >= 1
+    assert len({cell.name for cell in cells}) == len(cells)
+    assert all(cell.runs >= 2 and cell.generations >= 10 for cell in cells)
+    for cell in cells:
+        depth, variant = chapter3.split_name(cell.name)
+        assert cell.algorithm.env.depth == depth
+        assert variant.startswith(tuple(chapter3.VARIANTS))
+        assert pathlib.Path(cell.name).name == cell.name  # it is the name of a folder
+
+
+@pytest.mark.parametrize("budget", BUDGETS)
+def test_cells_of_one_name_are_the_same_in_every_experiment(budget):
+    """They share their runs."""
+    seen = {}
+    for name in base.MODULES:
+        for cell in experiment(name).cells(budget):
+            kept = seen.setdefault(cell.name, cell)
+            assert kept.algorithm == cell.algorithm
+            assert (kept.generations, kept.runs) == (cell.generations, cell.runs)
+    assert len(seen) > 3
+
+
+def numbers(value):
+    """Every number in a tree of JSON."""
+    if isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from numbers(inner)
+    elif isinstance(value, int | float):
+        yield value
+
+
+@pytest.mark.parametrize("name", base.MODULES)
+def test_its_numbers_are_plain_and_its_page_renders(name, runs):
+    module = experiment(name)
+    chosen = cells_of(name, runs)
+    measured = module.measure(chosen, "smoke")
+    text = json.dumps(measured, allow_nan=False)
+    assert json.loads(text) == measured
+    assert np.isfinite(list(numbers(measured))).all()
+    assert json.loads(base._compact(measured)) == measured
+    sections = module.sections(json.loads(text))
+    assert len(sections) >= 1
+    html = page.render(
+        page.Page(module.TITLE, module.PUBLISHED, f"credo reproduce {name}", sections)
+    )
+    for section in sections:
+        assert escape(section.title) in html
+    assert ">nan" not in html
+
+
+def test_success_is_that_of_the_champions_on_sequences_of_their_own(runs):
+    group = runs["classification 2-deep ours"]
+    measured = fig_3_4a.measure({"classification 2-deep ours": group}, "smoke")
+    (cell,) = measured.values()
+    assert len(cell["success"]) == SEEDS
+    assert all(0 <= s <= 1 and round(1000 * s) == pytest.approx(1000 * s) for s in cell["success"])
+    assert cell["floor"][1] == pytest.approx(0.75)
+    last = [run.metrics["champion_score"][-1] for run in group]
+    assert cell["curve"]["last raw"] == pytest.approx(last, abs=1e-4)
+    assert cell["curve"]["generation"] == [10]
+    smooth = [run.metrics["champion_score"].mean() for run in group]  # fewer than 100 generations
+    assert cell["curve"]["last smoothed"] == pytest.approx(smooth, abs=1e-4)
+
+
+def test_a_sweep_over_gaps_agrees_with_the_task_itself(runs):
+    """A gap of fixed length, as data and as a task."""
+    policies = chapter3.champions(runs["classification 2-deep as coded"])
+    wide, key = SequenceClassification(depth=2, min_gap=0, max_gap=3), jax.random.key(0)
+    for gap in (0, 3):
+        exact = chapter3.success(SequenceClassification(2, gap, gap), policies, episodes=400)
+        swept = chapter3.success_with_gap(wide, policies, np.int32(gap), key=key, episodes=400)
+        np.testing.assert_allclose(swept, exact, atol=0.14)  # other sequences: 4 σ
+
+
+def test_numbers_are_written_with_their_spread():
+    assert chapter3.percent([0.5, 0.7]) == "60.0 ± 10.0"
+    assert chapter3.spread([0.5, 0.6, 1.0]) == "60.0 (50.0…100.0)"
+    assert chapter3.split_name("recall 6-deep as coded") == (6, "as coded")
+
+
+def test_reproduce_trains_once_and_repeats_itself(tmp_path, monkeypatch):
+    name = "classification 2-deep ours"
+    cells = [base.Cell(name, TINY[name], GENERATIONS, 2)]
+    monkeypatch.setattr(fig_3_4a, "cells", lambda budget: cells)
+    folders = {"output": tmp_path / "pages", "work": tmp_path / "work"}
+    html = base.reproduce("fig-3.4a", "smoke", runs=1, jobs=1, **folders)
+    assert html == tmp_path / "pages" / "fig-3.4a" / "smoke" / "report.html"
+    results = html.with_name("results.json")
+    before, page_before = results.read_bytes(), html.read_bytes()
+    record = json.loads(before)
+    assert record["command"] == "credo reproduce fig-3.4a --budget smoke --runs 1"
+    assert record["cells"][name]["runs"] == 1
+    assert len(record["measured"][name]["success"]) == 1
+    trained = sorted(path.name for path in (tmp_path / "work" / "smoke" / name).iterdir())
+    assert trained == ["0"]
+
+    def refuse(core):
+        raise AssertionError("what is finished was trained again")
+
+    monkeypatch.setattr(executor, "_start", refuse)
+    base.reproduce("fig-3.4a", "smoke", runs=1, jobs=1, **folders)
+    assert results.read_bytes() == before
+    assert html.read_bytes() == page_before

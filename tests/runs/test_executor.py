@@ -1,0 +1,169 @@
+"""Many runs, a process each: what is finished stays, what fails is told, the rest goes on."""
+
+import dataclasses
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from credo.algorithms.neuroevolution import Neuroevolution
+from credo.environments.sequence_classification import SequenceClassification
+from credo.networks.mmu import MMU
+from credo.runs import config, executor, loop
+
+ALGORITHM = Neuroevolution(
+    SequenceClassification(depth=2, min_gap=1, max_gap=2),
+    MMU(hidden=3),
+    population_size=10,
+    episodes=4,
+    test_episodes=6,
+)
+IMPOSSIBLE = config.to_tree(ALGORITHM)
+IMPOSSIBLE["env"] = IMPOSSIBLE["env"] | {"depth": 0}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Three jobs, one of them impossible, by two workers; and what was said."""
+    folder = tmp_path_factory.mktemp("jobs")
+    jobs = [
+        executor.Job(folder / "0", ALGORITHM, 5, seed=0),
+        executor.Job(folder / "bad", IMPOSSIBLE, 5, seed=0),
+        executor.Job(folder / "1", ALGORITHM, 5, seed=1),
+    ]
+    with pytest.raises(loop.RunError) as error:
+        executor.run(jobs, workers=2)
+    return jobs, str(error.value)
+
+
+def test_a_failure_is_told_and_the_others_finish(trained):
+    (first, bad, second), told = trained
+    assert told.startswith("1 of 3 runs failed:")
+    assert f"{bad.path}: ValueError: depth is 0: it must be at least 1" in told
+    assert (first.finished(), bad.finished(), second.finished()) == (True, False, True)
+    for seed, job in enumerate((first, second)):
+        run = loop.Run(job.path)
+        assert run.config["seed"] == seed
+        assert run.algorithm == ALGORITHM
+        assert run.metrics["generation"].tolist() == [1, 2, 3, 4, 5]
+
+
+def test_a_worker_trains_like_this_process(trained, tmp_path):
+    (first, *_), _ = trained
+    path = tmp_path / "here"
+    loop.train(ALGORITHM, generations=5, path=path, tensorboard=False, progress=False)
+    for name in ("metrics.csv", "champion.safetensors"):
+        assert (path / name).read_bytes() == (first.path / name).read_bytes()
+
+
+def test_what_is_finished_is_not_run_again(trained, monkeypatch):
+    (first, _, second), _ = trained
+    started = []
+    monkeypatch.setattr(executor, "_start", lambda core: started.append(core))
+    executor.run([first, second], workers=2)
+    assert started == []
+    longer = dataclasses.replace(first, generations=6)
+    assert not longer.finished()
+    assert dataclasses.replace(first, generations=4).finished()
+
+
+def test_what_reached_its_score_is_finished(trained):
+    (first, *_), _ = trained
+    score = float(loop.Run(first.path).metrics["champion_score"][-1])
+    longer = dataclasses.replace(first, generations=100)
+    assert dataclasses.replace(longer, stop_at=score - 0.01).finished()
+    assert not dataclasses.replace(longer, stop_at=score + 0.01).finished()
+    assert np.isfinite(score)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"seed": 7}, "other settings .seed."),
+        (
+            {"algorithm": dataclasses.replace(ALGORITHM, episodes=5)},
+            "other settings .episodes: 4 != 5.: remove it or choose another folder",
+        ),
+    ],
+)
+def test_a_folder_with_another_run_is_refused(trained, changes, told):
+    (first, *_), _ = trained
+    before = (first.path / "config.json").read_bytes()
+    with pytest.raises(loop.RunError, match=told):
+        executor.run([dataclasses.replace(first, **changes)])
+    assert (first.path / "config.json").read_bytes() == before
+
+
+DIES_ONCE = """
+import json, os, pathlib, sys
+for line in sys.stdin:
+    job = json.loads(line)
+    if job["seed"] == 0:
+        os.kill(os.getpid(), 9)
+    print(json.dumps({"ok": job["path"]}), flush=True)
+"""
+
+
+def test_a_process_that_dies_is_told_and_replaced(tmp_path, monkeypatch):
+    started = []
+
+    def start(core):
+        command, pipe = [sys.executable, "-c", DIES_ONCE], subprocess.PIPE
+        started.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True))
+        return started[-1]
+
+    monkeypatch.setattr(executor, "_start", start)
+    jobs = [executor.Job(tmp_path / str(seed), ALGORITHM, 5, seed) for seed in range(3)]
+    with pytest.raises(loop.RunError) as error:
+        executor.run(jobs, workers=1)
+    assert str(error.value) == (
+        f"1 of 3 runs failed:\n{jobs[0].path}: its process ended with exit code -9"
+    )
+    assert [process.returncode for process in started] == [-9, 0]
+
+
+def test_a_job_stopped_half_way_goes_on(trained, tmp_path):
+    (first, *_), _ = trained
+    path = tmp_path / "half"
+    quiet = {"tensorboard": False, "progress": False}
+    loop.train(ALGORITHM, generations=5, path=path, callback=lambda g, m: True, **quiet)
+    job = dataclasses.replace(first, path=path)
+    assert not job.finished()
+    executor.run([job])
+    assert job.finished()
+    assert (path / "metrics.csv").read_bytes() == (first.path / "metrics.csv").read_bytes()
+
+
+def test_a_signal_reaches_every_worker_and_each_saves(tmp_path):
+    arguments = "train neuroevolution sequence-classification --depth 2 --min-gap 1 --max-gap 2"
+    arguments += " --population-size 10 --episodes 4 --test-episodes 6 --network.hidden 3"
+    arguments += f" --generations 1000000 --seeds 2 --path {tmp_path}"
+    command = [
+        sys.executable,
+        "-c",
+        # Two workers, also where there is one core.
+        "import sys; from credo import cli; from credo.runs import executor as e; run = e.run\n"
+        "e.run = lambda jobs: run(jobs, workers=2)\ncli.main(sys.argv[1:])",
+        *arguments.split(),
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    paths = [tmp_path / "seed-0", tmp_path / "seed-1"]
+    try:
+        give_up = time.monotonic() + 120
+        while not all((path / "metrics.csv").exists() for path in paths):
+            assert process.poll() is None
+            assert time.monotonic() < give_up
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130, told
+    assert "credo: stopped and saved; the same command goes on where it was" in told
+    assert "Traceback" not in told
+    for path in paths:
+        newest = sorted(folder.name for folder in (path / "checkpoints").glob("[0-9]*"))[-1]
+        assert int(newest) == loop.Run(path).metrics["generation"][-1] >= 1

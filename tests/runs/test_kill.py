@@ -1,0 +1,31 @@
+"""A run that is killed at random moments and resumed ends in the bytes of one left alone."""
+
+import importlib.util
+import pathlib
+
+path = pathlib.Path(__file__).with_name("kill.py")
+specification = importlib.util.spec_from_file_location("kill", path)
+assert specification is not None
+assert specification.loader is not None
+kill = importlib.util.module_from_spec(specification)
+specification.loader.exec_module(kill)
+
+
+def test_killed_three_times(tmp_path):
+    assert kill.compare(tmp_path, kills=3, generations=600, seed=1) == []
+    assert kill.rows(tmp_path / "killed") > 2  # dispatches, so there was something to kill
+    newest = sorted(p.name for p in (tmp_path / "killed" / "checkpoints").iterdir())[-1]
+    assert newest == "00000600"
+
+
+def test_a_difference_would_be_seen(tmp_path):
+    for name, content in (("a", b"1"), ("b", b"2")):
+        (tmp_path / name / "checkpoints" / "00000001").mkdir(parents=True)
+        for file in ("metrics.csv", "champion.safetensors", "checkpoints/00000001/COMMIT"):
+            (tmp_path / name / file).write_bytes(content)
+        (tmp_path / name / "config.json").write_text("{}")
+    assert kill.different(tmp_path / "a", tmp_path / "b") == [
+        "metrics.csv",
+        "champion.safetensors",
+        "checkpoints/00000001/COMMIT",
+    ]

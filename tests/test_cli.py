@@ -1,0 +1,335 @@
+"""The command line, from the help text to a report; wrong use ends with a suggestion."""
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+import textwrap
+import warnings
+
+import pytest
+
+from credo import cli
+from credo.runs.loop import Run
+
+TRAIN = (
+    "train neuroevolution sequence-classification --depth 2 --min-gap 1 --max-gap 2 "
+    "--population-size 10 --episodes 4 --test-episodes 6 --network.hidden 3 --tensorboard False"
+)
+
+
+@pytest.fixture(autouse=True)
+def as_it_was(monkeypatch):
+    """A command may change the process that it thinks its own."""
+    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+
+
+@pytest.fixture
+def credo(capsys):
+    """Run a command: its exit code, what it printed, and what it complained about."""
+
+    def run(*words: str) -> tuple[int, str, str]:
+        argv = [part for word in words for part in word.split()]
+        try:
+            cli.main(argv)
+            code = 0
+        except SystemExit as end:
+            code = end.code
+        out, err = capsys.readouterr()
+        assert "Traceback" not in out + err
+        return code, out, err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """What `credo train` leaves behind."""
+    path = tmp_path_factory.mktemp("cli") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(warnings, "showwarning", warnings.showwarning)
+        patch.setattr(sys, "path", list(sys.path))
+        cli.main(f"{TRAIN} --generations 1e1 --seed 3 --path {path}".split())
+    return path
+
+
+@pytest.mark.parametrize("words", [[], ["--help"], ["list"], ["--version"], ["train"]])
+def test_what_only_informs_imports_no_jax(words):
+    script = f"""
+        import sys
+        from credo import cli
+        try:
+            cli.main({words!r})
+        except SystemExit as end:
+            pass
+        print("jax" in sys.modules, "matplotlib" in sys.modules)
+        """
+    shown = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True
+    ).stdout
+    assert shown.splitlines()[-1] == "False False"
+    assert len(shown.splitlines()) >= 2
+
+
+def test_help_names_every_command(credo):
+    code, out, err = credo("--help")
+    assert (code, err) == (0, "")
+    for command in cli.COMMANDS:
+        assert f"\n  {command} " in out
+
+
+def test_list_names_everything(credo):
+    code, out, _ = credo("list")
+    assert code == 0
+    for names in (cli.TASKS, cli.ALGORITHMS, cli.NETWORKS, cli.EXPERIMENTS):
+        for name in names:
+            assert f"\n  {name} " in out
+    assert "fig-3.4a" not in credo("list tasks")[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint", "help"),
+    [
+        ("trian", "no command 'trian'", "did you mean 'train'?"),
+        ("dance", "no command 'dance'", "choose one of: list, train"),
+        ("list task", "nothing called 'task'", "did you mean 'tasks'?"),
+        ("train evolution sequence-recall", "no algorithm 'evolution'", "did you mean 'neuroevol"),
+        ("train neuroevolution sequence-recal", "no task 'sequence-recal'", "'sequence-recall'?"),
+        ("train neuroevolution nowhere:Task", "cannot import 'nowhere:Task'", "folder of its file"),
+        ("train neuroevolution os:sep", "os:sep is no task", "derive it from credo.Abstract"),
+        ("check os:getcwd", "os:getcwd is no task", "derive it from credo.AbstractEnvironment"),
+        ("check :Task", "no task ':Task'", "written package.module:Class"),
+        ("check os:Nothing", "cannot import 'os:Nothing'", "folder of its file"),
+        ("train neuroevolution sequence-recall --network lstn", "no network 'lstn'", "'lstm'?"),
+        ("train neuroevolution sequence-recall --preset our", "no preset 'our'", "'ours'?"),
+        ("train neuroevolution sequence-recall --network", "--network needs a value", ""),
+        (f"{TRAIN} --wall-clock soon", "wall-clock is 'soon'", "90s, 30m or 2h"),
+        (f"{TRAIN} --depth 0", "depth is 0: it must be at least 1", ""),
+        ("reproduce fig-3.4", "no experiment 'fig-3.4'", "did you mean 'fig-3.4a'?"),
+        ("reproduce fig-3.4a --budget quik", "no budget 'quik'", "did you mean 'quick'?"),
+    ],
+)
+def test_wrong_use_says_what_is_wrong_and_what_to_do(credo, words, complaint, help):
+    code, out, err = credo(words)
+    assert (code, out) == (2, "")
+    assert err.startswith("credo: ")
+    assert complaint in err
+    assert help in err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (f"{TRAIN} --dept 3", "--depth"),
+        (f"{TRAIN} --depth three", "three"),
+        (f"{TRAIN} --ties sometimes", "positive"),
+        ("resume somewhere --generation 3", "--generations"),
+        ("reproduce fig-3.4a --run 3", "--runs"),
+    ],
+)
+def test_a_wrong_flag_is_answered_with_the_right_one(credo, words, told):
+    code, out, err = credo(words)
+    assert code == 2
+    assert told in out + err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("resume nowhere", "nowhere is not a run: it has no config.json"),
+        ("evaluate nowhere", "nowhere is not a run"),
+        ("report nowhere", "nowhere is not a run"),
+        (f"{TRAIN} --generations 0", "generations is 0"),
+    ],
+)
+def test_what_cannot_be_done_ends_in_one_line(credo, words, told):
+    code, out, err = credo(words)
+    assert (code, out) == (1, "")
+    assert err.startswith("credo: ")
+    assert told in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["resume", "evaluate", "report", "check", "reproduce", "train"])
+def test_a_command_without_its_argument_shows_its_usage(credo, command):
+    code, out, _ = credo(command)
+    assert code == 2
+    assert out.startswith(f"usage: credo {command} ")
+    code, out, _ = credo(command, "--help")
+    assert code == 0
+    assert f"credo {command}" in out
+
+
+def test_every_flag_is_listed_with_its_meaning_and_default(credo):
+    code, out, _ = credo("train neuroevolution sequence-classification --help")
+    assert code == 0
+    for flag in ("--depth", "--network.hidden", "--mutation.strength", "--generations"):
+        assert flag in out
+    assert "signals per sequence" in out
+    assert "21" in out
+
+
+def test_train_leaves_a_run_with_the_flags_in_it(run):
+    trained = Run(run)
+    algorithm = trained.algorithm
+    assert (algorithm.env.depth, algorithm.env.min_gap, algorithm.env.max_gap) == (2, 1, 2)
+    assert (algorithm.population_size, algorithm.episodes, algorithm.network.hidden) == (10, 4, 3)
+    assert trained.config["seed"] == 3
+    assert trained.config["algorithm"]["class"].endswith(":Neuroevolution")
+    assert trained.metrics["generation"].tolist() == list(range(1, 11))
+
+
+def test_a_preset_can_be_overridden_by_flags():
+    """What the flags are parsed into, without a run."""
+    from credo.algorithms.neuroevolution import Neuroevolution
+    from credo.environments.sequence_classification import SequenceClassification
+    from credo.networks.mmu import MMU
+
+    argv = ["--depth", "5", "--episodes", "7", "--mutation.strength", "0.3", "--seed", "4"]
+    algorithm, options = cli._configured(
+        "credo train", Neuroevolution.ours, SequenceClassification(), MMU(), argv
+    )
+    expected = Neuroevolution.ours(SequenceClassification(depth=5), MMU(), episodes=7)
+    mutation = dataclasses.replace(expected.mutation, strength=0.3)
+    assert type(algorithm) is Neuroevolution
+    assert algorithm == dataclasses.replace(expected, mutation=mutation)
+    assert options.seed == 4
+
+
+def test_training_again_in_the_same_folder_is_refused(credo, run):
+    code, out, err = credo(f"{TRAIN} --path {run}")
+    assert (code, out) == (1, "")
+    assert f"{run} holds a run already: `credo resume {run}`" in err
+
+
+def test_resume_to_a_larger_budget(credo, run, tmp_path):
+    path = tmp_path / "run"
+    assert credo(f"{TRAIN} --seed 3 --generations 4 --path {path}")[0] == 0
+    code, out, _ = credo(f"resume {path} --generations 1e1")
+    assert code == 0
+    assert out.startswith(f"{path}: generation 10, best fitness ")
+    assert "on 6 fresh episodes" in out
+    for name in ("metrics.csv", "champion.safetensors"):
+        assert (path / name).read_bytes() == (run / name).read_bytes()
+    code, _, err = credo(f"resume {path} --generations 5")
+    assert code == 1
+    assert "must be larger, not 5" in err
+
+
+def test_stop_at_and_wall_clock_end_a_run_early(credo, tmp_path):
+    for i, flags in enumerate(("--stop-at 0.0", "--wall-clock 0s")):
+        code, out, _ = credo(f"{TRAIN} --generations 1000 --path {tmp_path / str(i)} {flags}")
+        assert code == 0
+        assert f"{tmp_path / str(i)}: generation 1," in out
+
+
+def test_evaluate_plays_fresh_episodes_of_any_depth(credo, run):
+    code, out, _ = credo(f"evaluate {run} --episodes 40")
+    assert code == 0
+    lines = out.splitlines()
+    assert lines[0] == f"{run}: 40 fresh episodes"
+    assert [line.split()[0] for line in lines[1:]] == [
+        "fitness",
+        "accuracy",
+        "success",
+        "steps",
+        "floor",
+    ]
+    assert 3 <= float(lines[4].split()[1]) <= 4  # depth 2, a gap of 1 or 2
+    assert credo(f"evaluate {run} --episodes 40")[1] == out
+    assert credo(f"evaluate {run} --episodes 40 --seed 1")[1] != out
+    deeper = credo(f"evaluate {run} --episodes 40 --depth 5")[1].splitlines()
+    assert 9 <= float(deeper[4].split()[1]) <= 13
+
+
+def test_evaluate_streams_what_is_very_deep(credo, run):
+    code, out, _ = credo(f"evaluate {run} --depth 2e3 --episodes 3")
+    assert code == 0
+    first, success, right = out.splitlines()
+    assert first == f"{run}: 3 streams of 2,000 signals"
+    assert 0 <= float(success.split()[1]) <= 1
+    assert "median" in right
+
+
+def test_report_is_a_page_about_the_runs(credo, run, tmp_path):
+    code, out, _ = credo(f"report {run} -o {tmp_path / 'page.html'}")
+    assert (code, out) == (0, f"page: {tmp_path / 'page.html'}\n")
+    page = (tmp_path / "page.html").read_text()
+    assert "Neuroevolution" in page
+    assert "SequenceClassification(depth=2, min_gap=1, max_gap=2" in page
+    assert f"credo report {run}" in re.sub("<[^>]*>", "", page)
+
+
+def test_several_seeds_are_trained_in_processes_of_their_own(credo, run, tmp_path):
+    code, out, _ = credo(f"{TRAIN} --generations 10 --seed 2 --seeds 2 --path {tmp_path / 'runs'}")
+    assert code == 0
+    assert f"compare them: credo report {tmp_path / 'runs'}/seed-*" in out
+    runs = [tmp_path / "runs" / f"seed-{seed}" for seed in (2, 3)]
+    assert [Run(path).config["seed"] for path in runs] == [2, 3]
+    assert (runs[1] / "metrics.csv").read_bytes() == (run / "metrics.csv").read_bytes()
+    code, *_ = credo("report", *map(str, runs), f"-o {tmp_path / 'both.html'}")
+    assert code == 0
+    assert "Neuroevolution: 2, 3" in (tmp_path / "both.html").read_text()
+
+
+TASK = """
+    from typing import ClassVar
+    import jax.numpy as jnp
+    from credo.environments.probes import Copy
+    from credo.types import TimeStep
+
+    class Good(Copy):
+        pass
+
+    class Broken(Copy):
+        def step(self, state, action, *, key):
+            state, t = super().step(state, action, key=key)
+            rewards = {name: r * jnp.nan for name, r in t.rewards.items()}
+            return state, TimeStep(t.obs, rewards, t.terminated, t.truncated)
+
+    class NeedsMore(Copy):
+        shape: int
+        def __init__(self, shape):
+            self.shape = shape
+    """
+
+
+@pytest.fixture
+def own_tasks(tmp_path, monkeypatch):
+    (tmp_path / "tasks_of_mine.py").write_text(textwrap.dedent(TASK))
+    monkeypatch.chdir(tmp_path)
+    yield "tasks_of_mine"
+    sys.modules.pop("tasks_of_mine", None)
+
+
+def test_check_finds_nothing_wrong_with_a_good_task(credo, own_tasks):
+    assert credo("check", f"{own_tasks}:Good") == (0, f"{own_tasks}:Good: 0 problems found\n", "")
+
+
+def test_check_names_the_fault_of_a_broken_task(credo, own_tasks):
+    code, out, _ = credo("check", f"{own_tasks}:Broken")
+    *problems, last = out.splitlines()
+    assert code == 1
+    assert len(problems) >= 1
+    assert any("NaN" in problem or "finite" in problem for problem in problems)
+    assert last.startswith(f"{own_tasks}:Broken: {len(problems)} problem")
+
+
+def test_a_task_that_needs_arguments_is_refused(credo, own_tasks):
+    code, _, err = credo("check", f"{own_tasks}:NeedsMore")
+    assert code == 2
+    assert "cannot be made without arguments" in err
+
+
+def test_a_task_of_ones_own_is_trained_and_resumed(credo, own_tasks, tmp_path):
+    flags = "--population-size 4 --episodes 2 --test-episodes 2 --network mlp --tensorboard False"
+    path = tmp_path / "run"
+    words = f"train neuroevolution {own_tasks}:Good {flags} --generations 1 --path {path}"
+    assert credo(words)[0] == 0
+    record = json.loads((path / "config.json").read_text())
+    assert record["algorithm"]["env"]["class"] == f"{own_tasks}:Good"
+    code, out, _ = credo(f"resume {path} --generations 2")
+    assert code == 0
+    assert "generation 2," in out
