@@ -7,10 +7,9 @@ import jax
 
 import credo
 from credo import tree
-from credo.evolution.mutation import AbstractMutation
 
 
-class Cauchy(AbstractMutation):
+class Cauchy(credo.AbstractMutation):
     """Add Cauchy noise to every weight: mostly small steps, now and then a huge one."""
 
     scale: float = 0.05  # half the steps are smaller than this

@@ -107,6 +107,8 @@ def test_list_names_everything(credo):
         ("train neuroevolution sequence-recall --network", "--network needs a value", ""),
         (f"{TRAIN} --wall-clock soon", "wall-clock is 'soon'", "90s, 30m or 2h"),
         (f"{TRAIN} --depth 0", "depth is 0: it must be at least 1", ""),
+        (f"{TRAIN} --generations 0", "--generations is 0: it must be at least 1", ""),
+        (f"{TRAIN} --seeds 0", "--seeds is 0: it must be at least 1", ""),
         ("reproduce fig-3.4", "no experiment 'fig-3.4'", "did you mean 'fig-3.4a'?"),
         ("reproduce fig-3.4a --budget quik", "no budget 'quik'", "did you mean 'quick'?"),
     ],
@@ -141,7 +143,6 @@ def test_a_wrong_flag_is_answered_with_the_right_one(credo, words, told):
         ("resume nowhere", "nowhere is not a run: it has no config.json"),
         ("evaluate nowhere", "nowhere is not a run"),
         ("report nowhere", "nowhere is not a run"),
-        (f"{TRAIN} --generations 0", "generations is 0"),
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(credo, words, told):

@@ -151,14 +151,14 @@ class TrainOptions:
 def _train(argv: list[str]) -> None:
     usage = "usage: credo train ALGORITHM TASK [--network NAME] [--preset NAME] [flags]"
     names = [token for token in argv[:2] if not token.startswith("-")]
+    if names and names[0] not in ALGORITHMS:
+        fail(f"no algorithm {names[0]!r}", names[0], ALGORITHMS)
     if len(names) < 2:
         print(usage)
         print("\nalgorithms:", ", ".join(ALGORITHMS), "\ntasks:     ", ", ".join(TASKS))
         print("            or package.module:Class\nnetworks:  ", ", ".join(NETWORKS))
         print("\ncredo train ALGORITHM TASK --help lists every flag with its unit and default.")
         raise SystemExit(0 if {"-h", "--help"} & set(argv) else 2)
-    if names[0] not in ALGORITHMS:
-        fail(f"no algorithm {names[0]!r}", names[0], ALGORITHMS)
     network_name, argv = _pop_option(argv[2:], "--network", "mmu")
     preset, argv = _pop_option(argv, "--preset", "")
     if network_name not in NETWORKS:
@@ -175,6 +175,9 @@ def _train(argv: list[str]) -> None:
     prog = f"credo train {names[0]} {names[1]}"
     algorithm, options = _configured(prog, build, env, _load(path)(**fields), argv)
     seconds = _seconds(options.wall_clock)
+    for name in ("generations", "seeds", "keep"):
+        if getattr(options, name) < 1:
+            fail(f"--{name} is {getattr(options, name)}: it must be at least 1")
 
     from .runs import loop
 
@@ -217,6 +220,9 @@ def _train_seeds(algorithm: Any, options: TrainOptions, seconds: float | None) -
             seed,
             stop_at=options.stop_at,
             wall_clock=seconds,
+            checkpoint_every=options.checkpoint_every,
+            keep=options.keep,
+            tensorboard=options.tensorboard,
         )
         for seed in range(options.seed, options.seed + options.seeds)
     ]
@@ -379,7 +385,7 @@ def _pop_option(argv: list[str], name: str, default: str, short: str = "") -> tu
     """Take `--name value` or `--name=value` out of the arguments."""
     rest, value, tokens = [], default, iter(argv)
     for token in tokens:
-        if token in (name, short):
+        if token == name or (short and token == short):
             value = next(tokens, "")
             if not value:
                 fail(f"{name} needs a value")

@@ -34,6 +34,8 @@ def jit(function):
 
 def enable_cache() -> None:
     """Keep compiled programs in `~/.cache/credo` (or `$CREDO_CACHE`) between processes."""
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
+        return  # the user's own choice, with thresholds of their own
     jax.config.update("jax_compilation_cache_dir", str(cache_directory / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)

@@ -136,7 +136,7 @@ def test_a_smaller_budget_is_refused(straight):
 
 
 def test_an_impossible_budget_is_refused(tmp_path):
-    with pytest.raises(loop.RunError, match="generations is 0"):
+    with pytest.raises(ValueError, match="generations is 0"):
         train(tmp_path / "run", generations=0)
     assert not (tmp_path / "run").exists()
 
@@ -395,3 +395,40 @@ def test_a_run_moves_with_its_folder(straight, tmp_path):
         warnings.simplefilter("error")
         resume(tmp_path / "moved", generations=BUDGET)
     assert contents(tmp_path / "moved") == contents(straight)
+
+
+def test_what_a_killed_start_left_behind_is_not_taken_over(straight, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copytree(straight / "checkpoints", run / "checkpoints")
+    fresh = train(run, generations=2)
+    assert fresh.metrics["generation"].tolist() == [1, 2]
+
+
+def test_a_run_with_a_mutation_of_a_script_can_be_reopened(tmp_path):
+    """`python script.py` records its classes under the file's name, not as `__main__`."""
+    (tmp_path / "my_script.py").write_text(
+        "import credo, jax\n"
+        "from credo import tree\n"
+        "class Nudge(credo.AbstractMutation):\n"
+        "    def __call__(self, genome, *, key):\n"
+        "        w, unravel, _ = tree.ravel(genome)\n"
+        "        return unravel(w + jax.random.normal(key, w.shape))\n"
+        "if __name__ == '__main__':\n"
+        "    task = credo.SequenceClassification(depth=2, min_gap=1, max_gap=1)\n"
+        "    algorithm = credo.Neuroevolution(task, credo.MMU(hidden=2), mutation=Nudge(),\n"
+        "                                     population_size=4)\n"
+        "    credo.train(algorithm, generations=1, path='run', progress=False)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "my_script.py"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    done = subprocess.run(
+        [sys.executable, "-m", "credo.cli", "evaluate", "run", "--episodes", "2"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "2 fresh episodes" in done.stdout

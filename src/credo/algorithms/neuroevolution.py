@@ -52,8 +52,8 @@ def _names(signals: str | tuple[str, ...]) -> tuple[str, ...]:
 class NeuroevolutionState(eqx.Module):
     population: PyTree  # leaves [pop, ...]; bred, not yet evaluated
     champion: PyTree  # the best of the generation before
-    record: Float[Array, " pop"]  # mean fitness of a member in earlier generations
-    age: Int[Array, " pop"]  # how many generations that mean is over; 0: bred just now
+    record: Float[Array, " pop"]  # running mean of a member's fitness in earlier generations
+    age: Int[Array, " pop"]  # how many generations that mean counts for; 0: bred just now
     level: Int[Array, ""]  # of the curriculum
 
 
@@ -74,7 +74,8 @@ class Neuroevolution(eqx.Module):
     """Cross every parent that selection drew before, so that no two offspring are clones."""
     extinction: Extinction = Extinction(probability=0.0)
     elite_memory: int = eqx.field(static=True, default=1)
-    """Generations over which the fitness of an elite is averaged; 1: the last alone."""
+    """How many generations of an elite are averaged; from then on the newest counts one such
+    part. 1: the last generation alone. A curriculum's earlier levels stay in the record."""
     curriculum: Curriculum | None = None  # None: the whole task from the start
     parsimony: Parsimony | None = None  # bonus for simple genomes, times their score
     fitness: tuple[str, ...] = eqx.field(static=True, default=(), converter=_names)
@@ -194,7 +195,7 @@ class Neuroevolution(eqx.Module):
 def assess(
     algorithm: Neuroevolution, state: NeuroevolutionState, evaluation: Evaluation
 ) -> tuple[Float[Array, " pop"], Float[Array, " pop"]]:
-    """Fitness, with earlier generations of an elite averaged in; and that of this one alone."""
+    """Fitness, with earlier generations of an elite mixed in; and that of this one alone."""
     signals = algorithm.fitness or algorithm.env.signals[:1]
     total = jnp.stack([evaluation.returns[name] for name in signals]).sum(axis=0)
     returns = jnp.mean(total, axis=1)
@@ -202,7 +203,9 @@ def assess(
         score = evaluation.returns[algorithm.score or algorithm.env.signals[-1]]
         returns = returns + algorithm.parsimony(state.population) * jnp.mean(score, axis=1)
     age = state.age.astype(jnp.float32)
-    return (state.record * age + returns) / (age + 1.0), returns
+    mixed = (state.record * age + returns) / (age + 1.0)
+    # A member without a record must not meet one that is NaN or infinite.
+    return jnp.where(state.age > 0, mixed, returns), returns
 
 
 @jit

@@ -57,7 +57,9 @@ def recall_floors(depth: int) -> dict[str, float]:
 
 def known(task: object) -> bool:
     """Whether `floor` has an answer for this task."""
-    return isinstance(task, SequenceClassification | SequenceRecall)
+    if isinstance(task, SequenceClassification):
+        return task.persistence == 0.5  # the count is over equally likely sequences
+    return isinstance(task, SequenceRecall)
 
 
 def floor(task: AbstractSequenceTask) -> tuple[str, float]:

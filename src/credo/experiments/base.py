@@ -33,6 +33,7 @@ class Cell(eqx.Module):
     algorithm: Any
     generations: int
     runs: int
+    first_seed: int = 0  # settings chosen by looking at some seeds are reported on others
 
 
 class Experiment(Protocol):
@@ -73,13 +74,13 @@ def reproduce(
         for cell in module.cells(budget)
     ]
     folder = {
-        cell.name: [work / budget / cell.name / str(s) for s in range(cell.runs)] for cell in cells
+        cell.name: [work / budget / cell.name / str(s) for s in seeds(cell)] for cell in cells
     }
     executor.run(
         [
             executor.Job(path, cell.algorithm, cell.generations, seed)
             for cell in cells
-            for seed, path in enumerate(folder[cell.name])
+            for seed, path in zip(seeds(cell), folder[cell.name], strict=True)
         ],
         jobs,
         title=f"{name} {budget}",
@@ -93,6 +94,7 @@ def reproduce(
         "cells": {
             cell.name: {
                 "runs": cell.runs,
+                "first seed": cell.first_seed,
                 "generations": cell.generations,
                 "algorithm": config.to_tree(cell.algorithm),
             }
@@ -105,6 +107,10 @@ def reproduce(
     target.mkdir(parents=True, exist_ok=True)
     (target / "results.json").write_text(_compact(results))
     return page(target / "results.json")
+
+
+def seeds(cell: Cell) -> range:
+    return range(cell.first_seed, cell.first_seed + cell.runs)
 
 
 def page(results: pathlib.Path) -> pathlib.Path:

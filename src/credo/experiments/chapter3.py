@@ -26,6 +26,7 @@ VARIANTS = {
     "as coded": Neuroevolution.as_coded,
     "ours": Neuroevolution.ours,
 }
+FIRST_SEED = {"ours": 100}  # our settings were chosen by looking at seeds 0 to 9
 
 
 def classification_cells(
@@ -39,6 +40,7 @@ def classification_cells(
             VARIANTS[variant](SequenceClassification(depth=depth), MMU(hidden=5)),
             generations,
             runs,
+            FIRST_SEED.get(variant, 0),
         )
         for variant in variants
         for depth in depths or DEPTHS[budget]
@@ -58,6 +60,7 @@ def recall_cells(budget: str, variants: tuple[str, ...] = ("as coded", "ours")) 
             VARIANTS[variant](SequenceRecall(depth=depth), MMU(hidden=20)),
             generations,
             runs,
+            FIRST_SEED.get(variant, 0),
         )
         for variant in variants
         for depth in depths
@@ -100,6 +103,19 @@ def success_with_gap(
     sequences = jax.vmap(sequence)(jax.random.split(key, episodes))
     sequences = jax.tree.map(lambda x: x[None], sequences)
     return jnp.mean(play_sequences(task, policies, sequences).returns["success"], axis=1)
+
+
+def first_mistakes(
+    policies: PyTree, depth: int, *, seed: int, episodes: int = TEST, batches: int = 50
+) -> np.ndarray:
+    """Signals answered right before the first mistake `[policies, episodes]`, at most `depth`.
+    Sequences of one batch share their distractors; so there are many batches."""
+    keys = jax.random.split(jax.random.key(seed), batches)
+    parts = [
+        np.asarray(counting.longest_correct(policies, depth, episodes // batches, key=key))
+        for key in keys
+    ]
+    return np.concatenate(parts, axis=1)
 
 
 def curves(runs: list[Run], every: int = 10) -> dict[str, Any]:

@@ -2,10 +2,9 @@
 
 from typing import Any
 
-import jax
 import numpy as np
 
-from ..analysis import counting, floors
+from ..analysis import floors
 from ..runs.loop import Run
 from ..runs.page import Curve, Figure, Reference, Table
 from . import chapter3, fig_3_4a
@@ -31,10 +30,8 @@ def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
     depth up to there: success at depth d is a first mistake after signal d."""
     measured = {}
     for name, cell in runs.items():
-        lengths = counting.longest_correct(
-            chapter3.champions(cell), DEPTHS[-1], chapter3.TEST, key=jax.random.key(40_000)
-        )
-        success = np.stack([(np.asarray(lengths) >= d).mean(axis=1) for d in DEPTHS], axis=1)
+        lengths = chapter3.first_mistakes(chapter3.champions(cell), DEPTHS[-1], seed=40_000)
+        success = np.stack([(lengths >= d).mean(axis=1) for d in DEPTHS], axis=1)
         measured[name] = {"depths": list(DEPTHS), "success": chapter3.rounded(success)}
     return measured
 

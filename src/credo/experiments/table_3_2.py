@@ -77,13 +77,15 @@ def verdicts(name: str, cell: dict[str, Any]) -> Table:
         ],
         rows,
         caption="Counted: the signals of one sign at each of which the cell moved the same way, "
-        "before it once did not. Random signals: answered right in a row in streams of ±1.",
+        "before it once did not. Random signals: answered right in a row in streams of ±1, "
+        "which share their distractors.",
     )
 
 
 def champion(name: str, cell: dict[str, Any]) -> Table:
     """The dissertation's table for the champion that goes furthest."""
-    best = int(np.argmax([(min(r), np.mean(r)) for r in cell["random signals right"]], axis=0)[0])
+    right = cell["random signals right"]
+    best = max(range(len(right)), key=lambda i: (min(right[i]), np.mean(right[i])))
     memory = cell["memory"][best]
     return Table(
         f"{name}: memory of run {best}",

@@ -91,9 +91,9 @@ class MMU(AbstractNetwork):
             shapes |= {"m_0": (m,)}
         weights = draw(shapes, self.initializer, key=key)
         if self.start_weights == "saturated":
-            scale = {"K": 30.0, "R": 0.1, "Z": 75.0}
+            scale = {"K": 30.0, "R": 0.1}
             weights = {name: scale.get(name[0], 1.0) * w for name, w in weights.items()}
-            weights["Z_y"] = jnp.clip(weights["Z_y"], -40.0, 40.0)
+            weights["Z_y"] = jnp.clip(75.0 * weights["Z_y"], -40.0, 40.0)
             weights |= {"b_w": weights["b_w"] - 20.0, "b_r": weights["b_r"] + 20.0}
         return MMUPolicy(config=self, **weights)
 

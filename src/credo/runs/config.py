@@ -1,8 +1,9 @@
 """The object is its config: object trees as JSON and back, and the record of versions and machine.
 
 Reading builds `equinox.Module` objects from their fields. A class is looked up by name: in Credo
-itself, or, for an environment or network of your own, in a module that you have installed. Nothing
-stored in a run is executed.
+itself, or, for an environment, network or operator of your own, in a module of yours, which is
+imported. Nothing that is stored in a run is executed, but a config can name a module on your path:
+look into a stranger's config.json before you resume it.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ import json
 import os
 import pathlib
 import platform
+import sys
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +23,18 @@ import jax
 import numpy as np
 
 from ..environments.base import AbstractEnvironment
+from ..evolution.crossover import AbstractCrossover
+from ..evolution.mutation import AbstractMutation
+from ..evolution.selection import AbstractSelection
 from ..networks.base import AbstractNetwork
+
+EXTENSIONS = (
+    AbstractEnvironment,
+    AbstractNetwork,
+    AbstractMutation,
+    AbstractCrossover,
+    AbstractSelection,
+)
 
 
 class ConfigError(ValueError):
@@ -32,18 +45,18 @@ def to_tree(value: Any) -> Any:
     """An object tree as plain JSON values. Floats keep every bit."""
     if isinstance(value, eqx.Module):
         fields = {f.name: to_tree(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        return {"class": f"{type(value).__module__}:{type(value).__qualname__}", **fields}
+        return {"class": class_name(type(value)), **fields}
     if isinstance(value, dict):
         return {str(k): to_tree(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [to_tree(v) for v in value]
-    if isinstance(value, np.ndarray | np.generic | jax.Array):
-        return np.asarray(value).tolist()
+    if isinstance(value, np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0:
+        return np.asarray(value).item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
     raise ConfigError(
-        f"a field holds {value!r}: only numbers, strings, tuples and Modules can be recorded; "
-        "make it a field of one of these, or a Module of your own"
+        f"a field holds {value!r}: only numbers, strings, tuples and Modules can be recorded in a "
+        "config; make it one of these, or compute it in a property"
     )
 
 
@@ -67,6 +80,22 @@ def from_tree(tree: Any) -> Any:
     return cls(**fields)
 
 
+def class_name(cls: type) -> str:
+    """`package.module:Class`, by which `find_class` finds it again."""
+    module = cls.__module__
+    if module == "__main__":  # a script: its file has a name under which it can be imported
+        file = getattr(sys.modules["__main__"], "__file__", None)
+        if file is None:
+            raise ConfigError(
+                f"{cls.__name__} was defined at a prompt: put it into a file, or its runs could "
+                "not be resumed"
+            )
+        module = pathlib.Path(file).stem
+    if "." in cls.__qualname__:
+        raise ConfigError(f"{cls.__qualname__} is defined inside something: move it to the module")
+    return f"{module}:{cls.__name__}"
+
+
 def find_class(name: str) -> type:
     """The Module class `package.module:Class`."""
     module, _, attribute = name.partition(":")
@@ -80,9 +109,9 @@ def find_class(name: str) -> type:
     if not (inspect.isclass(cls) and issubclass(cls, eqx.Module)):
         raise ConfigError(f"{name!r} is not an equinox.Module class")
     own = module.split(".")[0] == "credo"
-    if not own and not issubclass(cls, AbstractEnvironment | AbstractNetwork):
+    if not own and not issubclass(cls, EXTENSIONS):
         # A stored name must not be able to call an arbitrary class of the machine.
-        raise ConfigError(f"{name!r} is neither Credo's nor an environment or network of yours")
+        raise ConfigError(f"{name!r} is neither Credo's nor one of the kinds that extend it")
     return cls
 
 
@@ -112,10 +141,17 @@ def machine() -> dict[str, Any]:
     return {
         "versions": {"python": platform.python_version(), **versions},
         "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": len(available_cores()),
         "device": jax.devices()[0].device_kind,
         "system": platform.platform(),
     }
+
+
+def available_cores() -> list[int]:
+    """The cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
 
 
 def _processor() -> str:

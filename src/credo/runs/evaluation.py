@@ -19,7 +19,8 @@ def describe(run: Run, task: Any, episodes: int, seed: int) -> Iterator[str]:
     """Lines about the champion on `task`, which may differ from the one it was trained on."""
     policies = tree.stack(run.champion)
     key = jax.random.fold_in(jax.random.key(seed), 1_000_003)  # not a key of any training run
-    if isinstance(task, SequenceClassification) and task.depth > STREAMED:
+    streamed = isinstance(task, SequenceClassification) and task.persistence == 0.5
+    if streamed and task.depth > STREAMED:
         streams = min(episodes, 20)
         lengths = counting.longest_correct(
             policies,

@@ -4,7 +4,6 @@ both. What is finished is not run again; what was stopped goes on."""
 import contextlib
 import dataclasses
 import json
-import os
 import pathlib
 import subprocess
 import sys
@@ -29,6 +28,9 @@ class Job:
     seed: int
     stop_at: float | None = None
     wall_clock: float | None = None  # seconds
+    checkpoint_every: float = 60.0  # seconds
+    keep: int = 3
+    tensorboard: bool = False
 
     @property
     def tree(self) -> dict[str, Any]:
@@ -43,6 +45,8 @@ class Job:
             return False
         recorded = Run(self.path).config
         lines = config.differences(recorded["algorithm"], self.tree)
+        if recorded["budget"]["generations"] > self.generations:
+            lines.append(f"generations: {recorded['budget']['generations']} != {self.generations}")
         if recorded["seed"] != self.seed or lines:
             raise RunError(
                 f"{self.path} holds a run with other settings ({'; '.join(lines) or 'seed'}): "
@@ -52,11 +56,11 @@ class Job:
         if not champion.exists():
             return False
         done = int(checkpoint.read_metadata(champion)["generation"])
-        return done >= self.generations or (self.stop_at is not None and self._stopped(recorded))
-
-    def _stopped(self, recorded: dict[str, Any]) -> bool:
-        scores = Run(self.path).metrics.get("champion_score", [])
-        return len(scores) > 0 and scores[-1] >= self.stop_at
+        if self.stop_at is not None:
+            scores = Run(self.path).metrics.get("champion_score", [])
+            if len(scores) and scores[-1] >= self.stop_at - 1e-6:
+                return True
+        return done >= self.generations
 
     def message(self) -> str:
         fields = dataclasses.asdict(self) | {"path": str(self.path), "algorithm": self.tree}
@@ -69,7 +73,7 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
     waiting = [job for job in jobs if not job.finished()]
     if not waiting:
         return
-    cores = sorted(os.sched_getaffinity(0))
+    cores = config.available_cores()
     workers = min(workers or len(cores), len(waiting))
     failures: list[str] = []
     console = Console(file=sys.stderr)
@@ -113,7 +117,8 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
 
     with Signals() as signals, bar:
         threads = [
-            threading.Thread(target=work, args=(cores[i % len(cores)],)) for i in range(workers)
+            threading.Thread(target=work, args=(cores[i % len(cores)],), daemon=True)
+            for i in range(workers)
         ]
         for thread in threads:
             thread.start()
@@ -125,6 +130,8 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
                     if process.poll() is None:
                         process.send_signal(signals.received)
             time.sleep(0.05)
+    if done < len(waiting) and not (signals.received or failures):
+        failures.append(f"{len(waiting) - done} runs were never started: a worker could not start")
     if signals.received:
         raise Interrupted(
             "stopped and saved; the same command goes on where it was", 128 + signals.received

@@ -15,7 +15,7 @@ class Progress:
 
     def __init__(self, path: pathlib.Path, generation: int, budget: int, shown: bool = True):
         self.shown, self.path, self.budget = shown, path, budget
-        self.generation, self.rate = generation, 0.0
+        self.generation, self.rate, self.updates = generation, 0.0, 0
         self.console = Console(file=sys.stderr)
         self.bar = Bar(
             TextColumn("{task.description}"),
@@ -39,10 +39,10 @@ class Progress:
         """`count` generations took `seconds`; `row` holds the metrics of the last."""
         if not self.shown:
             return
-        first = self.rate == 0.0
         rate = count / max(seconds, 1e-9)
         # The first dispatch compiles: its rate says nothing about the time left.
-        self.rate = rate if self.rate < 1.0 / 3 else 0.8 * self.rate + 0.2 * rate
+        first, self.updates = self.updates == 0, self.updates + 1
+        self.rate = rate if self.updates <= 2 else 0.8 * self.rate + 0.2 * rate
         frames = row["frames"] / max(generation, 1) * self.rate
         left = "…" if first else _clock((self.budget - generation) / self.rate)
         text = (

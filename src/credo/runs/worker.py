@@ -4,41 +4,55 @@ Started by `executor`; it ends when its input does."""
 import json
 import os
 import pathlib
+import signal
 import sys
+import threading
+import time
+
+
+def _end_with_parent(parent: int) -> None:
+    """Save and end when the parent is gone: nobody would read the answer."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def main() -> None:
-    os.sched_setaffinity(0, {int(sys.argv[1])})  # before JAX counts its threads
+    if hasattr(os, "sched_setaffinity"):  # not on macOS
+        os.sched_setaffinity(0, {int(sys.argv[1])})  # before JAX counts its threads
+    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     sys.path.insert(0, os.getcwd())
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever prints must not look like an answer
 
+    import jax
+
     from . import config, loop
 
+    before = None
     for line in sys.stdin:
         job = json.loads(line)
+        if job["algorithm"] != before:
+            jax.clear_caches()  # programs of an earlier cell would pile up
+            before = job["algorithm"]
         path = pathlib.Path(job["path"])
         try:
+            options = {
+                name: job[name]
+                for name in (
+                    "generations",
+                    "stop_at",
+                    "wall_clock",
+                    "checkpoint_every",
+                    "keep",
+                    "tensorboard",
+                )
+            }
             if (path / "config.json").exists():
-                loop.resume(
-                    path,
-                    generations=job["generations"],
-                    stop_at=job["stop_at"],
-                    wall_clock=job["wall_clock"],
-                    tensorboard=False,
-                    progress=False,
-                )
+                loop.resume(path, progress=False, **options)
             else:
-                loop.train(
-                    config.from_tree(job["algorithm"]),
-                    generations=job["generations"],
-                    seed=job["seed"],
-                    path=path,
-                    stop_at=job["stop_at"],
-                    wall_clock=job["wall_clock"],
-                    tensorboard=False,
-                    progress=False,
-                )
+                algorithm = config.from_tree(job["algorithm"])
+                loop.train(algorithm, seed=job["seed"], path=path, progress=False, **options)
             answer = {"ok": str(path)}
         except loop.Interrupted as stop:
             answers.write(json.dumps({"error": str(stop)}) + "\n")
