@@ -113,13 +113,12 @@ class Neuroevolution(eqx.Module):
     @classmethod
     def ours(cls, env: AbstractEnvironment, network: AbstractNetwork, **overrides) -> Self:
         """The best settings found, with their ablation in docs/neuroevolution.md: the author's
-        operators with weights clipped to ±40 and a tenth of the hits erasing; elites judged by
-        several generations. On a sequence task also a curriculum, the share of right answers as
-        fitness, and parsimony; on Sequence Classification the curriculum's signals persist. An
-        MMU starts with saturated gates."""
+        operators with weights clipped to ±40 and a tenth of the hits erasing. On a sequence task
+        also a curriculum, the share of right answers as fitness, and parsimony; on Sequence
+        Classification the curriculum's signals persist. An MMU starts with saturated gates."""
         limit = 40.0
         mutation = replace(_author_mutation(), limit=limit, reset_probability=0.1, reset_std=0.0)
-        settings: dict[str, Any] = {"elite_memory": 6, "mutation": mutation}
+        settings: dict[str, Any] = {"mutation": mutation}
         if isinstance(env, AbstractSequenceTask):
             persistent = isinstance(env, SequenceClassification)
             whole = replace(env, persistence=0.8) if persistent else None

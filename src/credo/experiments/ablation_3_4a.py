@@ -37,7 +37,6 @@ INGREDIENTS = {
     ),
     "without persistent signals": _without(lambda ours: {"curriculum": Curriculum()}),
     "with the author's fitness": _without(lambda ours: {"fitness": ()}),
-    "without elite memory": _without(lambda ours: {"elite_memory": 1}),
     "without parsimony": _without(lambda ours: {"parsimony": None}),
     "without erasing": _without(
         lambda ours: {"mutation": dataclasses.replace(ours.mutation, reset_probability=0.0)}
@@ -45,6 +44,7 @@ INGREDIENTS = {
     "without limit": _without(
         lambda ours: {"mutation": dataclasses.replace(ours.mutation, limit=1e12)}
     ),
+    "with elite memory of 6": _without(lambda ours: {"elite_memory": 6}),
     "without crossover": _without(lambda ours: {"cross_repeated": False}),
 }
 

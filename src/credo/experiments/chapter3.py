@@ -20,13 +20,13 @@ from ..runs.loop import Run
 from .base import Cell
 
 TEST = 1000  # fresh sequences for a final champion; the dissertation used 50
-DEPTHS = {"smoke": (2, 5), "quick": (2, 5, 10, 21), "full": (2, 3, 4, 5, 6, 10, 15, 21)}
+DEPTHS = {"smoke": (3,), "quick": (2, 5, 10, 21), "full": (2, 3, 4, 5, 6, 10, 15, 21)}
 VARIANTS = {
     "as written": Neuroevolution,
     "as coded": Neuroevolution.as_coded,
     "ours": Neuroevolution.ours,
 }
-FIRST_SEED = {"ours": 100}  # our settings were chosen by looking at seeds 0 to 9
+FIRST_SEED = {"ours": 200}  # our settings were chosen by looking at seeds 0 to 109
 
 
 def classification_cells(
@@ -50,7 +50,7 @@ def classification_cells(
 def recall_cells(budget: str, variants: tuple[str, ...] = ("as coded", "ours")) -> list[Cell]:
     """One cell per variant and depth, 20-cell MMU as in the author's code."""
     runs, generations, depths = {
-        "smoke": (2, 10, (1, 2)),
+        "smoke": (2, 10, (2,)),
         "quick": (3, 500, (1, 2, 3, 4, 6)),
         "full": (10, 10_000, (1, 2, 3, 4, 5, 6)),
     }[budget]
@@ -151,7 +151,7 @@ def spread(x: Any) -> str:
 
 
 def deepest_cells(budget: str, variants: tuple[str, ...] = ("ours",)) -> list[Cell]:
-    """The 21-deep runs of Figure 3.4a, that the case study looks into (5-deep at smoke)."""
+    """The 21-deep runs of Figure 3.4a, that the case study looks into (3-deep at smoke)."""
     return classification_cells(budget, depths=(max(DEPTHS[budget]),), variants=variants)
 
 
