@@ -5,7 +5,7 @@
 or, from the folder of this file:
 
     credo check own_environment:SameAsFirst
-    credo train neuroevolution own_environment:SameAsFirst --generations 150
+    credo train neuroevolution own_environment:SameAsFirst --preset ours --generations 150
 """
 
 import equinox as eqx

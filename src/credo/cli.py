@@ -10,6 +10,7 @@ import os
 import pathlib
 import re
 import sys
+import traceback
 import warnings
 from typing import Annotated, Any, NoReturn
 
@@ -49,8 +50,13 @@ EXPERIMENTS = {
     "fig-3.10": "recall in corridors of 1..101 steps",
     "ablation-3.4a": "our settings less one ingredient, 21-deep",
 }
+PRESETS = {
+    "as-written": "Algorithm 2 as printed (the default)",
+    "as-coded": "the author's operators of 2017",
+    "ours": "the best settings found: start here for a task of your own",
+}
 COMMANDS = {
-    "list": "tasks, algorithms, networks and experiments",
+    "list": "tasks, algorithms, networks, presets and experiments",
     "train": "train an algorithm on a task: credo train neuroevolution sequence-classification",
     "resume": "go on with a run, also to a larger budget",
     "evaluate": "play fresh episodes with a run's champion",
@@ -117,6 +123,7 @@ def _list(argv: list[str]) -> None:
         "tasks": {name: text for name, (_, text) in TASKS.items()},
         "algorithms": {name: text for name, (_, text) in ALGORITHMS.items()},
         "networks": {name: text for name, (_, _, text) in NETWORKS.items()},
+        "presets": PRESETS,
         "experiments": EXPERIMENTS,
     }
     if argv and argv[0] in ("-h", "--help"):
@@ -157,6 +164,7 @@ def _train(argv: list[str]) -> None:
         print(usage)
         print("\nalgorithms:", ", ".join(ALGORITHMS), "\ntasks:     ", ", ".join(TASKS))
         print("            or package.module:Class\nnetworks:  ", ", ".join(NETWORKS))
+        print("presets:   ", ", ".join(PRESETS), "(default: as-written)")
         print("\ncredo train ALGORITHM TASK --help lists every flag with its unit and default.")
         raise SystemExit(0 if {"-h", "--help"} & set(argv) else 2)
     network_name, argv = _pop_option(argv[2:], "--network", "mmu")
@@ -164,6 +172,11 @@ def _train(argv: list[str]) -> None:
     if network_name not in NETWORKS:
         fail(f"no network {network_name!r}", network_name, NETWORKS)
     env = _task(names[1])
+    if ":" in names[1]:
+        problems = _problems(env)
+        if problems:
+            print("\n".join(f"- {problem}" for problem in problems), file=sys.stderr)
+            fail(f"{names[1]} cannot be trained on before this is mended")
     path, fields, _ = NETWORKS[network_name]
     algorithm_class = _load(ALGORITHMS[names[0]][0])
     build: Any = algorithm_class
@@ -344,9 +357,7 @@ def _report(argv: list[str]) -> None:
 def _check(argv: list[str]) -> None:
     name, argv = _positional(argv, "check TASK", "a task's name or package.module:Class")
     env = _task(name)
-    from .environments.checks import check_environment
-
-    problems = check_environment(env)
+    problems = _problems(env)
     for problem in problems:
         print(f"- {problem}")
     print(f"{name}: {len(problems)} problem{'s' * (len(problems) != 1)} found")
@@ -378,7 +389,28 @@ def _task(name: str) -> Any:
     try:
         return cls()
     except TypeError as error:
-        fail(f"{name} cannot be made without arguments ({error}): give every field a default")
+        fail(
+            f"{name} cannot be made without arguments ({error}): give every field a default, and "
+            "define obs_size and max_steps"
+        )
+
+
+def _problems(env: Any) -> list[str]:
+    """What `check_environment` finds; an exception of the task's own code is a problem too."""
+    from .environments.checks import check_environment
+
+    try:
+        return check_environment(env)
+    except Exception as error:  # the task is somebody else's code: say where, and what often helps
+        own = sys.modules[type(env).__module__].__file__
+        frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == own]
+        where = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+        first = str(error).partition("\n")[0]
+        return [
+            f"it raised {type(error).__name__}{where}: {first} (everything runs inside JAX: choose "
+            "with jnp.where, not `if`; methods are sample(self, *, key) and reward(self, answer, "
+            "target, scored, perfect))"
+        ]
 
 
 def _pop_option(argv: list[str], name: str, default: str, short: str = "") -> tuple[str, list[str]]:
@@ -492,6 +524,7 @@ def _guarded(go: Any) -> None:
         print(f"credo: {error}", file=sys.stderr)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
+        print("credo: stopped before the first generation", file=sys.stderr)
         raise SystemExit(130) from None
 
 

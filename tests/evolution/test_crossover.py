@@ -68,5 +68,5 @@ def test_a_key_is_a_child():
 
 
 def test_an_unknown_part_is_refused():
-    with pytest.raises(ValueError, match=r"part is 'column'.*'matrix', 'row' or 'entry'"):
+    with pytest.raises(ValueError, match=r"part is 'column'.*entry, matrix, row"):
         MaskedCrossover(part="column")

@@ -19,7 +19,7 @@ class Progress:
         self.console = Console(file=sys.stderr)
         self.bar = Bar(
             TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=10),
             TextColumn("{task.fields[text]}"),
             console=self.console,
             auto_refresh=False,
@@ -46,9 +46,9 @@ class Progress:
         frames = row["frames"] / max(generation, 1) * self.rate
         left = "…" if first else _clock((self.budget - generation) / self.rate)
         text = (
-            f"generation {generation}/{self.budget}  {_short(frames)} frames/s  "
-            f"best fitness {row['fitness_max']:.4g}  champion {row['champion_score']:.3f}  "
-            f"left {left}"
+            f"generation {generation}/{self.budget}  left {left}  champion "
+            f"{row['champion_score']:.3f}  best fitness {row['fitness_max']:.4g}  "
+            f"{_short(frames)} frames/s"
         )
         if self.console.is_terminal:
             self.bar.update(self.task, completed=generation, text=text, refresh=True)
