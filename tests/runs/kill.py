@@ -107,7 +107,7 @@ def compare(folder: pathlib.Path, kills: int, generations: int, seed: int = 0) -
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--generations", type=int, default=20_000)
+    parser.add_argument("--generations", type=int, default=60_000)
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
