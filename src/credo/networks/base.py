@@ -5,7 +5,8 @@ A network is two objects: a config such as `MMU(hidden=5)`, compared by value, a
 
 Recurrent cells are written *features first*: weights `[out, in, *batch]`, activations
 `[features, *batch]`. With no batch that is one network; with the population packed on the last
-axis it is the whole population in one contiguous loop, seven times faster on a CPU than `vmap`.
+axis it is the whole population in one contiguous loop, three times faster on a CPU than batched
+matrix products.
 """
 
 import abc
