@@ -64,7 +64,7 @@ def main() -> None:
     state = jit(algorithm.init)(key=jax.random.key(0))
     keys = jax.random.split(jax.random.key(1), (1, SEQUENCES))
     sequences = jax.vmap(jax.vmap(lambda key: task.sample(key=key)))(keys)
-    play = eqx.filter_jit(play_sequences)
+    play = jit(play_sequences)
     whole = jit(algorithm.generation)
 
     w = {

@@ -2,8 +2,8 @@
 
     python tests/runs/kill.py --kills 20
 
-Half of the kills fall anywhere in the life of a process (imports, the first checkpoint,
-compiling), half while it trains and writes. What must agree, byte for byte: metrics, champion,
+Half of the kills fall before a process trains (imports, the first checkpoint, compiling), half
+while it trains and writes; none after the run's end. What must agree, byte for byte: metrics, champion,
 config and the last checkpoint.
 """
 
@@ -61,20 +61,29 @@ def rows(run: pathlib.Path) -> int:
     return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
-def kill_once(run: pathlib.Path, generations: int, life: float, rng: random.Random) -> str:
+def trains(process: subprocess.Popen, run: pathlib.Path, before: int) -> float:
+    """Wait for the first row of metrics beyond `before`: the seconds that took."""
+    began = time.monotonic()
+    while process.poll() is None and rows(run) <= before and time.monotonic() - began < 120:
+        time.sleep(0.002)
+    return time.monotonic() - began
+
+
+def kill_once(run: pathlib.Path, generations: int, starting: float, rng: random.Random) -> str:
     """Start, wait for a random moment, SIGKILL. Says where the run then was."""
+    began, before = time.monotonic(), rows(run)
     process = start(run, generations)
-    before, began = rows(run), time.monotonic()
     if rng.random() < 0.5:
-        time.sleep(rng.uniform(0.0, life))
+        time.sleep(rng.uniform(0.0, starting))
     else:
-        while process.poll() is None and rows(run) <= before and time.monotonic() - began < 60:
-            time.sleep(0.002)
+        trains(process, run, before)
         time.sleep(rng.uniform(0.0, 0.5))
     ended = process.poll()
     process.send_signal(signal.SIGKILL)
     output, _ = process.communicate()
-    if ended not in (None, 0):
+    if ended == 0:
+        raise SystemExit("the run reached its end before a kill: give more --generations")
+    if ended is not None:
         raise SystemExit(f"credo failed with exit code {ended}:\n{output}")
     saved = sorted(p.name for p in (run / "checkpoints").glob("[0-9]*"))
     return f"after {time.monotonic() - began:.2f} s, newest checkpoint {saved[-1:] or 'none'}"
@@ -94,11 +103,14 @@ def different(a: pathlib.Path, b: pathlib.Path) -> list[str]:
 
 def compare(folder: pathlib.Path, kills: int, generations: int, seed: int = 0) -> list[str]:
     """The files in which a run killed `kills` times differs from one left alone."""
-    began = time.monotonic()
-    finish(folder / "alone", generations)
-    life, rng = time.monotonic() - began, random.Random(seed)
+    rng = random.Random(seed)
+    process = start(folder / "alone", generations)
+    starting = trains(process, folder / "alone", 0)
+    output, _ = process.communicate()
+    if process.returncode != 0:
+        raise SystemExit(f"credo failed with exit code {process.returncode}:\n{output}")
     for i in range(kills):
-        where = kill_once(folder / "killed", generations, life, rng)
+        where = kill_once(folder / "killed", generations, starting, rng)
         print(f"kill {i + 1:2d} {where}", flush=True)
     finish(folder / "killed", generations)
     return different(folder / "alone", folder / "killed")
@@ -107,7 +119,7 @@ def compare(folder: pathlib.Path, kills: int, generations: int, seed: int = 0) -
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--generations", type=int, default=60_000)
+    parser.add_argument("--generations", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
