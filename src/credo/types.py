@@ -38,3 +38,13 @@ class Evaluation(eqx.Module):
 
     returns: dict[str, Float[Array, "pop episodes"]]
     steps: Int[Array, "pop episodes"]  # environment steps taken; padding is not counted
+
+
+class Transition(eqx.Module):
+    """One frame as learners see it, or rows of them behind a leading axis."""
+
+    obs: Float[Array, "*rows obs"]
+    action: Float[Array, "*rows act"]
+    rewards: dict[str, Float[Array, "*rows"]]
+    next_obs: Float[Array, "*rows obs"]
+    terminated: Bool[Array, "*rows"]  # the task ended; after a time limit it did not

@@ -104,6 +104,7 @@ def different(a: pathlib.Path, b: pathlib.Path) -> list[str]:
 def compare(folder: pathlib.Path, kills: int, generations: int, seed: int = 0) -> list[str]:
     """The files in which a run killed `kills` times differs from one left alone."""
     rng = random.Random(seed)
+    finish(folder / "first", 1)  # compiles, so that the next start takes as long as those killed
     process = start(folder / "alone", generations)
     starting = trains(process, folder / "alone", 0)
     output, _ = process.communicate()

@@ -1,0 +1,58 @@
+"""The contract of environments that live outside JAX: NumPy, a simulator, a worker process."""
+
+import abc
+import dataclasses
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, UInt32
+
+
+@dataclasses.dataclass
+class HostStep:
+    """What `n` copies say after one step. Rows of copies that were not active mean nothing."""
+
+    obs: Float[np.ndarray, "n obs"]
+    rewards: dict[str, Float[np.ndarray, " n"]]
+    terminated: Bool[np.ndarray, " n"]  # the task ended: do not bootstrap
+    truncated: Bool[np.ndarray, " n"]  # the clock ran out: do bootstrap
+
+
+class AbstractCopies(abc.ABC):
+    """`n` copies of one environment, stepped together."""
+
+    n: int
+
+    @abc.abstractmethod
+    def reset(self, seeds: UInt32[np.ndarray, " n"], active: Bool[np.ndarray, " n"]) -> np.ndarray:
+        """A fresh episode in every active copy; its seed decides all that is random in it.
+
+        **Returns:** observations `[n, obs]`, float32.
+        """
+
+    @abc.abstractmethod
+    def step(
+        self, actions: Float[np.ndarray, "n act"], active: Bool[np.ndarray, " n"]
+    ) -> HostStep:
+        """One step of every active copy; the others cost nothing. Actions lie in [-1, 1]."""
+
+
+class AbstractHostEnvironment(eqx.Module):
+    """A task outside JAX: a config compared by value, whose `copies` play it."""
+
+    if TYPE_CHECKING:  # a type checker would take an AbstractVar for a field
+        obs_size: ClassVar[int]
+        action_size: ClassVar[int]
+        max_steps: ClassVar[int]
+        signals: ClassVar[tuple[str, ...]]
+    else:
+        obs_size: eqx.AbstractVar[int]
+        action_size: eqx.AbstractVar[int]
+        max_steps: eqx.AbstractVar[int]  # no episode is longer
+        signals: eqx.AbstractVar[tuple[str, ...]]  # names of the rewards, as in a JAX task
+    agents: ClassVar[int | None] = None
+
+    @abc.abstractmethod
+    def copies(self, n: int) -> AbstractCopies:
+        """`n` copies, kept open for the life of this process: asking again returns the same."""
