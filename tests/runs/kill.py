@@ -3,8 +3,8 @@
     python tests/runs/kill.py --kills 20
 
 Half of the kills fall before a process trains (imports, the first checkpoint, compiling), half
-while it trains and writes; none after the run's end. What must agree, byte for byte: metrics, champion,
-config and the last checkpoint.
+while it trains and writes; none after the run's end. What must agree, byte for byte: metrics,
+champion, config and the last checkpoint.
 """
 
 import argparse
