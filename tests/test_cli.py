@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -11,6 +12,8 @@ import warnings
 import pytest
 
 from credo import cli
+from credo.environments.gymnasium import Gymnasium
+from credo.networks.mlp import MLP
 from credo.runs.loop import Run
 
 TRAIN = (
@@ -108,6 +111,9 @@ def test_list_names_everything(credo):
         (f"{TRAIN} --wall-clock soon", "wall-clock is 'soon'", "90s, 30m or 2h"),
         (f"{TRAIN} --depth 0", "depth is 0: it must be at least 1", ""),
         (f"{TRAIN} --generations 0", "--generations is 0: it must be at least 1", ""),
+        (f"{TRAIN} --frames 0", "--frames is 0: it must be at least 1", ""),
+        ("train td3 Hoper-v5", "no task 'Hoper-v5'", "did you mean 'Hopper-v5'?"),
+        ("train td3 Pendulum-v1 --preset td4", "no preset 'td4' of td3", "'td3'?"),
         (f"{TRAIN} --seeds 0", "--seeds is 0: it must be at least 1", ""),
         ("reproduce fig-3.4", "no experiment 'fig-3.4'", "did you mean 'fig-3.4a'?"),
         ("reproduce fig-3.4a --budget quik", "no budget 'quik'", "did you mean 'quick'?"),
@@ -127,6 +133,8 @@ def test_wrong_use_says_what_is_wrong_and_what_to_do(credo, words, complaint, he
         (f"{TRAIN} --dept 3", "--depth"),
         (f"{TRAIN} --depth three", "three"),
         (f"{TRAIN} --ties sometimes", "positive"),
+        (f"{TRAIN} --netwrk lstm", "did you mean '--network'?"),
+        (f"{TRAIN} --form run", "did you mean '--from'?"),
         ("resume somewhere --generation 3", "--generations"),
         ("reproduce fig-3.4a --run 3", "--runs"),
     ],
@@ -214,6 +222,10 @@ def test_resume_to_a_larger_budget(credo, run, tmp_path):
     assert "on 6 fresh episodes" in out
     for name in ("metrics.csv", "champion.safetensors"):
         assert (path / name).read_bytes() == (run / name).read_bytes()
+    code, out, err = credo(f"resume {path}")
+    assert code == 0
+    assert out.startswith(f"{path}: generation 10, best fitness ")
+    assert f"{path} is finished: 10 of 10 generations; to go on give a larger" in err
     code, _, err = credo(f"resume {path} --generations 5")
     assert code == 1
     assert "must be larger, not 5" in err
@@ -275,9 +287,87 @@ def test_several_seeds_are_trained_in_processes_of_their_own(credo, run, tmp_pat
     assert "Neuroevolution: 2, 3" in (tmp_path / "both.html").read_text()
 
 
+def test_every_algorithm_is_made_of_its_preset():
+    env = Gymnasium("Pendulum-v1", in_process=True)
+    for name, entry in cli.ALGORITHMS.items():
+        build = cli._builder(name, entry.preset)
+        network = None if entry.network is None else MLP()
+        algorithm = build(env, network)
+        assert type(algorithm) is cli._load(entry.path)
+        assert algorithm.env == env
+
+
+def test_no_command_leaves_a_trace_when_it_is_stopped(credo, monkeypatch, tmp_path):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("credo.runs.loop._initial", stopped)
+    assert credo(TRAIN) == (130, "", "credo: stopped\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+OFF_POLICY = (
+    "--network mlp --network.hidden 4 --learner.critic.hidden 4 --learner.batch-size 4 "
+    "--start-frames 20 --test-every 20 --test-episodes 1 --replay-capacity 100 "
+    "--tensorboard False --in-process True --max-episode-steps 10"
+)
+
+
+@pytest.fixture(scope="module")
+def hosted(tmp_path_factory):
+    """A run of a Gymnasium task that pays at the end, in a folder of its own name."""
+    folder = tmp_path_factory.mktemp("hosted")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(warnings, "showwarning", warnings.showwarning)
+        patch.setattr(sys, "path", list(sys.path))
+        patch.chdir(folder)
+        flags = f"{OFF_POLICY} --learner.gamma 0.5 --delayed --frames 4e1"
+        cli.main(f"train td3 Pendulum-v1 {flags}".split())
+    return folder / "runs" / "td3-pendulum-v1-delayed-0"
+
+
+def test_a_task_of_gymnasium_is_trained_to_a_number_of_frames(hosted):
+    record = json.loads((hosted / "config.json").read_text())
+    algorithm = Run(hosted).algorithm
+    assert record["budget"] == {"generations": None, "frames": 40, "stop_at": None}
+    assert record["algorithm"]["env"]["class"].endswith(":DelayedHostReward")
+    assert (algorithm.env.env.id, algorithm.env.max_steps) == ("Pendulum-v1", 10)
+    assert (algorithm.learner.gamma, algorithm.learner.batch_size) == (0.5, 4)
+    assert Run(hosted).metrics["frames"].tolist() == [10, 20, 30, 40]
+
+
+def test_it_is_resumed_evaluated_and_started_from(credo, hosted, tmp_path):
+    shutil.copytree(hosted, tmp_path / "run")
+    code, out, _ = credo(f"resume {tmp_path / 'run'} --frames 60")
+    assert code == 0
+    assert out.startswith(f"{tmp_path / 'run'}: generation 6, best fitness ")
+    code, out, _ = credo(f"evaluate {hosted} --max-episode-steps 7")
+    lines = out.splitlines()
+    assert lines[0] == f"{hosted}: 20 fresh episodes"
+    assert lines[1].split()[0] == "reward"
+    assert lines[2].split() == ["steps", "7.0"]
+    words = f"train td3 Pendulum-v1 {OFF_POLICY} --frames 10 --from {hosted}"
+    assert credo(f"{words} --path {tmp_path / 'warm'}")[0] == 0
+    assert Run(tmp_path / "warm").config["warm_start"] == str(hosted)
+
+
+def test_an_environment_that_fails_ends_in_one_line(credo, own_tasks, tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "_require_sound", lambda *_: None)  # it would be found out
+    words = f"train td3 {own_tasks}:Crumbling {OFF_POLICY} --frames 1000 --path {tmp_path / 'run'}"
+    code, out, err = credo(words)
+    *_, last = err.splitlines()
+    assert (code, out) == (1, "")
+    assert last.startswith("credo: ")
+    assert "its floor gave way" in last
+    assert last.endswith(f"resume with `credo resume {tmp_path / 'run'}`")
+
+
 TASK = """
     from typing import ClassVar
+    import gymnasium
     import jax.numpy as jnp
+    import numpy as np
     from credo.environments.probes import Copy
     from credo.types import TimeStep
 
@@ -294,6 +384,21 @@ TASK = """
         shape: int
         def __init__(self, shape):
             self.shape = shape
+
+    class Crumbling(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,), np.float32)
+        steps = 0
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return np.zeros(2, np.float32), {}
+
+        def step(self, action):
+            self.steps += 1
+            if self.steps > 25:
+                raise RuntimeError("its floor gave way")
+            return np.zeros(2, np.float32), 0.0, False, False, {}
     """
 
 
@@ -316,6 +421,19 @@ def test_check_names_the_fault_of_a_broken_task(credo, own_tasks):
     assert len(problems) >= 1
     assert any("NaN" in problem or "finite" in problem for problem in problems)
     assert last.startswith(f"{own_tasks}:Broken: {len(problems)} problem")
+
+
+def test_a_gymnasium_class_of_ones_own_is_checked_with_its_flags(credo, own_tasks):
+    code, out, _ = credo("check", f"{own_tasks}:Crumbling")
+    assert code == 1
+    assert "no time limit" in out
+    words = f"train td3 {own_tasks}:Crumbling --frames 10"
+    code, out, err = credo(words)
+    assert (code, out) == (2, "")
+    assert "cannot be trained on before this is mended" in err
+    code, out, _ = credo(f"{words} {OFF_POLICY}")  # with --max-episode-steps
+    assert code == 0
+    assert out.startswith("runs/td3-crumbling-0: generation 1,")
 
 
 def test_a_task_that_needs_arguments_is_refused(credo, own_tasks):

@@ -26,7 +26,7 @@ NETWORKS = {
     "rnn": Recurrent(cell="rnn", hidden=3),
     "gru": Recurrent(cell="gru", hidden=3),
     "lstm": Recurrent(cell="lstm", hidden=3),
-    "mlp": MLP(width=3),
+    "mlp": MLP(hidden=(3,)),
 }
 
 
@@ -152,7 +152,7 @@ def test_common_worlds_and_worlds_of_ones_own():
 
 
 def test_the_fast_path_too_gives_each_member_its_own_worlds():
-    population = tree.stack(*[MLP(width=2).init(1, 1, key=jax.random.key(0))] * 2)
+    population = tree.stack(*[MLP(hidden=(2,)).init(1, 1, key=jax.random.key(0))] * 2)
     own = rollout.evaluate(CLASSIFICATION, population, 16, common=False, key=jax.random.key(1))
     common = rollout.evaluate(CLASSIFICATION, population, 16, key=jax.random.key(1))
     assert not np.array_equal(own.steps[0], own.steps[1])

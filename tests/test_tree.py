@@ -55,7 +55,7 @@ def test_stack_turns_floats_into_data_and_refuses_other_differences():
         tree.stack({"size": 3}, {"size": 4})
     with pytest.raises(ValueError, match="different structure"):
         tree.stack({"a": 1.0}, {"b": 1.0})
-    nets = (MLP(width=2), MLP(width=3))
+    nets = (MLP(hidden=(2,)), MLP(hidden=(3,)))
     with pytest.raises(ValueError, match="different structure"):
         tree.stack(*(net.init(1, 1, key=jax.random.key(0)) for net in nets))
 

@@ -4,7 +4,6 @@ Nothing here imports JAX before a command needs it: `credo --help` answers at on
 """
 
 import dataclasses
-import difflib
 import importlib
 import os
 import pathlib
@@ -12,13 +11,43 @@ import re
 import sys
 import traceback
 import warnings
-from typing import Annotated, Any, NoReturn
+from typing import Any, NamedTuple
+
+from .runs.arguments import fail, parse, plain_integer, pop_option, pop_switch, seconds
+
+
+class Entry(NamedTuple):
+    """An algorithm that can be named."""
+
+    path: str  # package.module:Class
+    preset: str  # of its `presets()`; "": the class itself
+    network: str | None  # None: the algorithm's own choice
+    text: str
+
 
 ALGORITHMS = {
-    "neuroevolution": (
+    "neuroevolution": Entry(
         "credo.algorithms.neuroevolution:Neuroevolution",
+        "",
+        "mmu",
         "evolve a population of networks (Algorithm 2)",
     ),
+    **{
+        name: Entry("credo.algorithms.erl:ERL", name, None, text)
+        for name, text in {
+            "erl": "a population and a gradient learner with one replay buffer (Algorithm 6)",
+            "cerl": "the same with a portfolio of learners that compete for frames",
+            "ea": "the population of erl without its learner",
+        }.items()
+    },
+    **{
+        name: Entry("credo.algorithms.off_policy:OffPolicy", name, None, text)
+        for name, text in {
+            "td3": "twin delayed deterministic policy gradient, alone",
+            "ddpg": "deep deterministic policy gradient, alone",
+            "sac": "soft actor-critic, alone",
+        }.items()
+    },
 }
 TASKS = {
     "sequence-classification": (
@@ -30,6 +59,7 @@ TASKS = {
         "hear directions, take them in order: deep T-maze (3.3)",
     ),
 }
+GYMNASIUM = "credo.environments.gymnasium:Gymnasium"  # any other task, by its id there
 NETWORKS = {
     "mmu": ("credo.networks.mmu:MMU", {}, "gated memory (equations 3.1-3.5)"),
     "rnn": ("credo.networks.recurrent:Recurrent", {"cell": "rnn"}, "Elman network"),
@@ -55,6 +85,7 @@ PRESETS = {
     "as-coded": "the author's operators of 2017",
     "ours": "the best settings found: start here for a task of your own",
 }
+POPPED = ("--network", "--preset", "--delayed", "--from")  # flags that are no fields
 COMMANDS = {
     "list": "tasks, algorithms, networks, presets and experiments",
     "train": "train an algorithm on a task: credo train neuroevolution sequence-classification",
@@ -80,13 +111,17 @@ def main(argv: list[str] | None = None) -> None:
     command, *rest = argv
     if command not in COMMANDS:
         fail(f"no command {command!r}", command, COMMANDS)
-    rest = [_plain_integer(token) for token in rest]
+    rest = [plain_integer(token) for token in rest]
     warnings.showwarning = lambda message, *_args, **_kw: print(
         f"warning: {message}", file=sys.stderr
     )
     # Environments of users lie where they work.
     sys.path.insert(0, os.getcwd())
-    globals()[f"_{command}"](rest)
+    try:
+        globals()[f"_{command}"](rest)
+    except KeyboardInterrupt:
+        print("credo: stopped", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def overview() -> str:
@@ -97,31 +132,13 @@ def overview() -> str:
     return "\n".join(lines)
 
 
-def fail(message: str, given: str = "", known: Any = ()) -> NoReturn:
-    """One line on what is wrong, one on what to do, exit code 2."""
-    print(f"credo: {message}", file=sys.stderr)
-    close = difflib.get_close_matches(given, list(known), n=1, cutoff=0.5)
-    if close:
-        print(f"       did you mean {close[0]!r}?", file=sys.stderr)
-    elif known:
-        print(f"       choose one of: {', '.join(known)}", file=sys.stderr)
-    raise SystemExit(2)
-
-
-def _plain_integer(token: str) -> str:
-    """`1e6` is a valid integer."""
-    if re.fullmatch(r"\d+(\.\d+)?e\+?\d+", token) and float(token).is_integer():
-        return str(int(float(token)))
-    return token
-
-
 # ------------------------------------------------------------------------------------ commands
 
 
 def _list(argv: list[str]) -> None:
     sections = {
         "tasks": {name: text for name, (_, text) in TASKS.items()},
-        "algorithms": {name: text for name, (_, text) in ALGORITHMS.items()},
+        "algorithms": {name: entry.text for name, entry in ALGORITHMS.items()},
         "networks": {name: text for name, (_, _, text) in NETWORKS.items()},
         "presets": PRESETS,
         "experiments": EXPERIMENTS,
@@ -137,14 +154,21 @@ def _list(argv: list[str]) -> None:
         for name, text in sections[title].items():
             print(f"  {name:<{width}}{text}")
     if not argv or argv[0] == "tasks":
-        print("  package.module:Class    a task of your own (see examples/own_environment.py)")
+        print("  Hopper-v5, …            any task that Gymnasium knows and whose actions are a box")
+        print("  package.module:Class    a task of your own (see examples/own_environment.py), or")
+        print("                          a gymnasium.Env class")
 
 
 @dataclasses.dataclass
 class TrainOptions:
-    """The run."""
+    """The run.
 
-    generations: int = 1000  # budget, in generations
+    Beside the flags below: --network NAME, --preset NAME, --delayed (the task pays the whole return
+    at its last step), --from RUN (start from the champion of another run).
+    """
+
+    generations: int | None = None  # budget; with no budget given, the algorithm's own
+    frames: int | None = None  # budget in environment steps, such as 1e6; ends the generation
     seed: int = 0  # everything random follows from it
     seeds: int = 1  # runs, with this seed and the ones after it, one process per core
     path: str | None = None  # the run's folder; None: runs/<algorithm>-<task>-<seed>
@@ -156,88 +180,93 @@ class TrainOptions:
 
 
 def _train(argv: list[str]) -> None:
-    usage = "usage: credo train ALGORITHM TASK [--network NAME] [--preset NAME] [flags]"
     names = [token for token in argv[:2] if not token.startswith("-")]
     if names and names[0] not in ALGORITHMS:
         fail(f"no algorithm {names[0]!r}", names[0], ALGORITHMS)
     if len(names) < 2:
-        print(usage)
-        print("\nalgorithms:", ", ".join(ALGORITHMS), "\ntasks:     ", ", ".join(TASKS))
-        print("            or package.module:Class\nnetworks:  ", ", ".join(NETWORKS))
-        print("presets:   ", ", ".join(PRESETS), "(default: as-written)")
-        print("\ncredo train ALGORITHM TASK --help lists every flag with its unit and default.")
+        print(_train_usage())
         raise SystemExit(0 if {"-h", "--help"} & set(argv) else 2)
-    network_name, argv = _pop_option(argv[2:], "--network", "mmu")
-    preset, argv = _pop_option(argv, "--preset", "")
-    if network_name not in NETWORKS:
+    entry = ALGORITHMS[names[0]]
+    network_name, argv = pop_option(argv[2:], "--network", entry.network or "")
+    preset, argv = pop_option(argv, "--preset", entry.preset)
+    warm_start, argv = pop_option(argv, "--from", "")
+    delayed, argv = pop_switch(argv, "--delayed")
+    if network_name and network_name not in NETWORKS:
         fail(f"no network {network_name!r}", network_name, NETWORKS)
     env = _task(names[1])
-    if ":" in names[1]:
-        problems = _problems(env)
-        if problems:
-            print("\n".join(f"- {problem}" for problem in problems), file=sys.stderr)
-            fail(f"{names[1]} cannot be trained on before this is mended")
-    path, fields, _ = NETWORKS[network_name]
-    algorithm_class = _load(ALGORITHMS[names[0]][0])
-    build: Any = algorithm_class
-    if preset:
-        presets = algorithm_class.presets()
-        if preset not in presets:
-            fail(f"no preset {preset!r} of {names[0]}", preset, presets)
-        build = presets[preset]
+    build, network = _builder(names[0], preset), None
+    if network_name:
+        path, fields, _ = NETWORKS[network_name]
+        network = _load(path)(**fields)
     prog = f"credo train {names[0]} {names[1]}"
-    algorithm, options = _configured(prog, build, env, _load(path)(**fields), argv)
-    seconds = _seconds(options.wall_clock)
-    for name in ("generations", "seeds", "keep"):
-        if getattr(options, name) < 1:
+    if delayed:
+        from .environments import wrappers
+
+        env = wrappers.delayed(env)
+    algorithm, options = _configured(prog, build, env, network, argv)
+    _require_sound(names[1], algorithm.env)
+    for name in ("generations", "frames", "seeds", "keep"):
+        if getattr(options, name) is not None and getattr(options, name) < 1:
             fail(f"--{name} is {getattr(options, name)}: it must be at least 1")
-
-    from .runs import loop
-
-    def start(seed: int, folder: str | None) -> None:
-        run = loop.train(
-            algorithm,
-            generations=options.generations,
-            seed=seed,
-            path=folder,
-            stop_at=options.stop_at,
-            wall_clock=seconds,
-            checkpoint_every=options.checkpoint_every,
-            keep=options.keep,
-            tensorboard=options.tensorboard,
-        )
-        print(_summary(run))
-
-    if options.seeds == 1:
-        _guarded(lambda: start(options.seed, options.path))
-    else:
-        _guarded(lambda: _train_seeds(algorithm, options, seconds))
+    fields = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
+    fields |= {"wall_clock": seconds(options.wall_clock), "warm_start": warm_start or None}
+    label = _label(names[0], names[1]) + "-delayed" * delayed
+    _guarded(lambda: _start(algorithm, label, **fields))
 
 
-def _configured(prog: str, build: Any, env: Any, network: Any, argv: list[str]) -> list:
+def _train_usage() -> str:
+    return f"""\
+usage: credo train ALGORITHM TASK [--network NAME] [--preset NAME] [--delayed] [--from RUN] [flags]
+
+algorithms: {", ".join(ALGORITHMS)}
+tasks:      {", ".join(TASKS)}
+            or one of Gymnasium, such as Hopper-v5
+            or package.module:Class
+networks:   {", ".join(NETWORKS)} (default: the algorithm's own)
+presets:    {", ".join(PRESETS)} (default: as-written), of neuroevolution
+
+credo train ALGORITHM TASK --help lists every flag with its unit and default."""
+
+
+def _builder(name: str, preset: str) -> Any:
+    """What makes an algorithm of a task and a network."""
+    algorithm_class = _load(ALGORITHMS[name].path)
+    if not preset:
+        return algorithm_class
+    presets = algorithm_class.presets()
+    if preset not in presets:
+        fail(f"no preset {preset!r} of {name}", preset, presets)
+    return presets[preset]
+
+
+def _configured(prog: str, build: Any, env: Any, network: Any, argv: list[str]) -> list[Any]:
     """The algorithm that `build` makes of a task and network with these flags, and the options."""
-    first, _ = _parse(prog, build(env, network), TrainOptions, argv)
-    # What a preset derives from the task must follow from the one asked for, not its defaults.
-    return _parse(prog, build(first.env, first.network), TrainOptions, argv)
+    try:
+        first, _ = parse(prog, build(env, network), TrainOptions, argv, popped=POPPED)
+        # What a preset derives from the task must follow from the one asked for, not its defaults.
+        return parse(prog, build(first.env, first.network), TrainOptions, argv, popped=POPPED)
+    except ValueError as error:  # a task and an algorithm that do not go together
+        fail(str(error))
 
 
-def _train_seeds(algorithm: Any, options: TrainOptions, seconds: float | None) -> None:
+def _label(algorithm: str, task: str) -> str:
+    """A run's name before its seed."""
+    task = TASKS[task][0] if task in TASKS else task
+    return f"{algorithm}-{task.rpartition(':')[2]}"
+
+
+def _start(algorithm: Any, label: str, *, seed: int, seeds: int, path: str | None, **options: Any):
+    """One run here, or several in processes of their own."""
     from .runs import executor, loop
 
-    base = pathlib.Path(options.path) if options.path else loop.free_name(algorithm, "seeds")
+    if seeds == 1:
+        folder = path or loop.free_name(algorithm, seed, label)
+        print(_summary(loop.train(algorithm, seed=seed, path=folder, **options)))
+        return
+    base = pathlib.Path(path) if path else loop.free_name(algorithm, "seeds", label)
     jobs = [
-        executor.Job(
-            base / f"seed-{seed}",
-            algorithm,
-            options.generations,
-            seed,
-            stop_at=options.stop_at,
-            wall_clock=seconds,
-            checkpoint_every=options.checkpoint_every,
-            keep=options.keep,
-            tensorboard=options.tensorboard,
-        )
-        for seed in range(options.seed, options.seed + options.seeds)
+        executor.Job(base / f"seed-{s}", algorithm, seed=s, **options)
+        for s in range(seed, seed + seeds)
     ]
     executor.run(jobs)
     for job in jobs:
@@ -249,7 +278,8 @@ def _train_seeds(algorithm: Any, options: TrainOptions, seconds: float | None) -
 class ResumeOptions:
     """Go on with a run."""
 
-    generations: int | None = None  # a larger budget; None: the run's own
+    generations: int | None = None  # a larger budget; with none given, the run's own
+    frames: int | None = None  # a larger budget in environment steps, such as 2e6
     stop_at: float | None = None  # end once the champion's score reaches this
     wall_clock: str | None = None  # end and save after this time: 90s, 30m, 2h
     checkpoint_every: float = 60.0  # seconds between checkpoints
@@ -258,7 +288,7 @@ class ResumeOptions:
 
 def _resume(argv: list[str]) -> None:
     path, argv = _positional(argv, "resume RUN", "the run's folder")
-    (options,) = _parse("credo resume RUN", None, ResumeOptions, argv)
+    (options,) = parse("credo resume RUN", None, ResumeOptions, argv)
 
     from .runs import loop
 
@@ -266,8 +296,9 @@ def _resume(argv: list[str]) -> None:
         run = loop.resume(
             path,
             generations=options.generations,
+            frames=options.frames,
             stop_at=options.stop_at,
-            wall_clock=_seconds(options.wall_clock),
+            wall_clock=seconds(options.wall_clock),
             checkpoint_every=options.checkpoint_every,
             keep=options.keep,
         )
@@ -280,7 +311,7 @@ def _resume(argv: list[str]) -> None:
 class EvaluateOptions:
     """Fresh episodes for a champion. Flags of the task, such as --depth 101, change the task."""
 
-    episodes: int = 1000  # episodes, all fresh
+    episodes: int | None = None  # episodes, all fresh; None: 1000, outside JAX 20
     seed: int = 0  # of the episodes
 
 
@@ -291,7 +322,7 @@ def _evaluate(argv: list[str]) -> None:
         from .runs import loop
 
         run = loop.Run(path)
-        task, options = _parse(
+        task, options = parse(
             "credo evaluate RUN", run.algorithm.env, EvaluateOptions, argv, flat=True
         )
         from .runs import evaluation
@@ -317,7 +348,7 @@ def _reproduce(argv: list[str]) -> None:
     name, argv = _positional(argv, "reproduce EXPERIMENT", "an experiment of `credo list`")
     if name not in EXPERIMENTS:
         fail(f"no experiment {name!r}", name, EXPERIMENTS)
-    (options,) = _parse(f"credo reproduce {name}", None, ReproduceOptions, argv)
+    (options,) = parse(f"credo reproduce {name}", None, ReproduceOptions, argv)
     if options.budget not in ("smoke", "quick", "full"):
         fail(f"no budget {options.budget!r}", options.budget, ("smoke", "quick", "full"))
 
@@ -338,7 +369,7 @@ def _reproduce(argv: list[str]) -> None:
 
 
 def _report(argv: list[str]) -> None:
-    output, argv = _pop_option(argv, "--output", "", "-o")
+    output, argv = pop_option(argv, "--output", "", "-o")
     if not argv or {"-h", "--help"} & set(argv):
         print("usage: credo report RUN [RUN …] [-o report.html]\n\n  one page about finished or")
         print("  running runs; runs that differ only in their seed are one curve")
@@ -373,19 +404,39 @@ def _load(path: str) -> Any:
 
 
 def _task(name: str) -> Any:
-    """A task by its name or as `package.module:Class`, with its defaults."""
+    """A task with its defaults: by our name for it, as `package.module:Class`, or by
+    Gymnasium's."""
     if name in TASKS:
         return _load(TASKS[name][0])()
-    if not re.fullmatch(r"\w+(\.\w+)*:\w+", name):
-        fail(f"no task {name!r}; one of your own is written package.module:Class", name, TASKS)
+    if re.fullmatch(r"\w+(\.\w+)*:\w+", name):
+        return _own_task(name)
+    import gymnasium
+
+    if name not in gymnasium.registry:
+        fail(
+            f"no task {name!r}; one of your own is written package.module:Class",
+            name,
+            TASKS,
+            gymnasium.registry,
+        )
+    return _load(GYMNASIUM)(id=name)
+
+
+def _own_task(name: str) -> Any:
     try:
         cls = _load(name)
     except (ImportError, AttributeError) as error:
         fail(f"cannot import {name!r}: {error}. Start credo in the folder of its file")
-    from .environments.base import AbstractEnvironment
+    import gymnasium
 
-    if not (isinstance(cls, type) and issubclass(cls, AbstractEnvironment)):
-        fail(f"{name} is no task: derive it from credo.AbstractEnvironment")
+    from .environments.base import AbstractEnvironment
+    from .environments.host import AbstractHostEnvironment
+
+    if isinstance(cls, type) and issubclass(cls, gymnasium.Env):
+        return _load(GYMNASIUM)(id=name)
+    ours = (AbstractEnvironment, AbstractHostEnvironment)
+    if not (isinstance(cls, type) and issubclass(cls, ours)):
+        fail(f"{name} is no task: derive it from credo.AbstractEnvironment or gymnasium.Env")
     try:
         return cls()
     except TypeError as error:
@@ -393,6 +444,22 @@ def _task(name: str) -> Any:
             f"{name} cannot be made without arguments ({error}): give every field a default, and "
             "define obs_size and max_steps"
         )
+
+
+def _require_sound(name: str, env: Any) -> None:
+    """End with what is wrong with a task that is not ours, before anything is trained on it."""
+    from .environments.host import EnvironmentFailure
+
+    if ":" in name:
+        problems = _problems(env)
+        if problems:
+            print("\n".join(f"- {problem}" for problem in problems), file=sys.stderr)
+            fail(f"{name} cannot be trained on before this is mended")
+    elif name not in TASKS:
+        try:
+            env.copies(1)
+        except EnvironmentFailure as failure:
+            fail(f"cannot make the task {name!r}: {failure}")
 
 
 def _problems(env: Any) -> list[str]:
@@ -413,21 +480,6 @@ def _problems(env: Any) -> list[str]:
         ]
 
 
-def _pop_option(argv: list[str], name: str, default: str, short: str = "") -> tuple[str, list[str]]:
-    """Take `--name value` or `--name=value` out of the arguments."""
-    rest, value, tokens = [], default, iter(argv)
-    for token in tokens:
-        if token == name or (short and token == short):
-            value = next(tokens, "")
-            if not value:
-                fail(f"{name} needs a value")
-        elif token.startswith(f"{name}="):
-            value = token.partition("=")[2]
-        else:
-            rest.append(token)
-    return value, rest
-
-
 def _positional(argv: list[str], usage: str, what: str) -> tuple[str, list[str]]:
     if argv and not argv[0].startswith("-"):
         return argv[0], argv[1:]
@@ -437,95 +489,33 @@ def _positional(argv: list[str], usage: str, what: str) -> tuple[str, list[str]]
     raise SystemExit(0 if argv else 2)
 
 
-def _parse(prog: str, default: Any, options: type, argv: list[str], flat: bool = False) -> list:
-    """Flags for the fields of `default` (if any) and of `options`.
-
-    A task's own fields need no prefix (`--depth`), those of other parts do (`--network.hidden`).
-    """
-    import tyro
-
-    arguments = []
-    if default is not None:
-        if not flat:
-            default = _with_plain_task(default)
-        plain = Annotated[type(default), tyro.conf.arg(name="")]
-        arguments.append(("object", plain, dataclasses.field(default=default)))
-    plain = Annotated[options, tyro.conf.arg(name="")]
-    arguments.append(("options", plain, dataclasses.field(default_factory=options)))
-    command = dataclasses.make_dataclass("Command", arguments)
-    command.__doc__ = options.__doc__
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Mutable type")
-        try:
-            parsed = tyro.cli(command, prog=prog, args=argv, config=(tyro.conf.FlagConversionOff,))
-        except ValueError as error:
-            fail(str(error))
-    result = [parsed.options]
-    if default is not None:
-        value = parsed.object
-        if not flat:
-            value = _original(value)
-        result.insert(0, value)
-    return result
-
-
-def _with_plain_task(algorithm: Any) -> Any:
-    """The algorithm as a class whose `env` flags have no prefix."""
-    import tyro
-
-    cls: Any = type(algorithm)
-    plain = Annotated[type(algorithm.env), tyro.conf.arg(name="")]
-    body = {
-        "__annotations__": {"env": plain},
-        "__module__": cls.__module__,
-        "__doc__": cls.__doc__,
-        "original": staticmethod(lambda: cls),
-    }
-    derived = type(cls)(cls.__name__, (cls,), body)
-    return derived(**{f.name: getattr(algorithm, f.name) for f in dataclasses.fields(algorithm)})
-
-
-def _original(algorithm: Any) -> Any:
-    fields = {f.name: getattr(algorithm, f.name) for f in dataclasses.fields(algorithm)}
-    return algorithm.original()(**fields)
-
-
-def _seconds(text: str | None) -> float | None:
-    if text is None:
-        return None
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text)
-    if match is None:
-        fail(f"wall-clock is {text!r}: write seconds, minutes or hours as 90s, 30m or 2h")
-    return float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]]
-
-
 def _summary(run: Any) -> str:
     metrics = run.metrics
+    episodes = run.config["algorithm"].get("test_episodes")
     return (
         f"{run.path}: generation {int(metrics['generation'][-1])}, best fitness "
-        f"{metrics['fitness_max'][-1]:.4g}, champion score {metrics['champion_score'][-1]:.3f} "
-        f"on {run.config['algorithm']['test_episodes']} fresh episodes"
+        f"{metrics['fitness_max'][-1]:.4g}, champion score {metrics['champion_score'][-1]:.4g}"
+        + (f" on {episodes} fresh episodes" if episodes is not None else "")
     )
 
 
 def _guarded(go: Any) -> None:
     """Errors that a user can mend end in one line; an interrupt with the code a shell expects."""
+    from .environments.host import EnvironmentFailure
     from .runs.checkpoint import CheckpointError
     from .runs.config import ConfigError
     from .runs.lock import RunLocked
     from .runs.loop import Interrupted, RunError
 
+    expected = (RunError, ConfigError, CheckpointError, RunLocked, EnvironmentFailure)
     try:
         go()
     except Interrupted as stop:
         print(f"credo: {stop}", file=sys.stderr)
         raise SystemExit(stop.code) from None
-    except (RunError, ConfigError, CheckpointError, RunLocked, ValueError, OSError) as error:
+    except (*expected, ValueError, OSError) as error:
         print(f"credo: {error}", file=sys.stderr)
         raise SystemExit(1) from None
-    except KeyboardInterrupt:
-        print("credo: stopped before the first generation", file=sys.stderr)
-        raise SystemExit(130) from None
 
 
 if __name__ == "__main__":

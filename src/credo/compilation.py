@@ -3,9 +3,11 @@
 import functools
 import os
 import pathlib
+from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import numpy as np
 
 cache_directory = pathlib.Path(
@@ -14,17 +16,21 @@ cache_directory = pathlib.Path(
 )
 
 
-def jit(function):
+def jit(function: Any = None, *, donate: Any = "none") -> Any:
     """`equinox.filter_jit` that treats Python floats as data.
 
     Under plain `filter_jit` a float is part of the program, so a new mutation strength or γ
-    compiles again. Sizes (`int`, `str`, `bool`) stay part of the program.
+    compiles again. Sizes (`int`, `str`, `bool`) stay part of the program. `donate` as there:
+    `"all-except-first"` lets the result take the place of every argument but the first.
     """
-    inner = eqx.filter_jit(function)
+    if function is None:
+        return functools.partial(jit, donate=donate)
+    inner = eqx.filter_jit(function, donate=donate)
     # XLA fills half of a 512-bit register unless told otherwise. With all of it a population of
     # 100 packed on the last axis plays twice as fast, to the same bits; processors without such
     # registers ignore it. JAX takes the option at the outermost `jit` only.
-    outer = eqx.filter_jit(function, compiler_options={"xla_cpu_prefer_vector_width": 512})
+    options: dict[str, Any] = {"compiler_options": {"xla_cpu_prefer_vector_width": 512}}
+    outer = eqx.filter_jit(function, donate=donate, **options)
 
     @functools.wraps(function)
     def call(*args, **kwargs):

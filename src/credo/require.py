@@ -20,3 +20,9 @@ def within(name: str, value: Any, low: float, high: float) -> None:
     """Raise if `value` is a number outside [low, high]. Arrays pass: they may be traced."""
     if isinstance(value, int | float) and not low <= value <= high:
         raise ValueError(f"{name} is {value}: it must lie in [{low:g}, {high:g}]")
+
+
+def signal(given: str | None, known: tuple[str, ...]) -> None:
+    """A reward signal of the task, or None."""
+    if given is not None and given not in known:
+        raise ValueError(f"no reward signal {given!r}: this task has {', '.join(known)}")

@@ -1,20 +1,32 @@
 """Playing episodes: the only place where a policy meets an environment."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from . import tree
 from .compilation import jit
 from .environments.base import AbstractEnvironment, AbstractSequenceTask, correct
+from .environments.host import AbstractHostEnvironment
 from .networks.base import AbstractPolicy
-from .types import Evaluation, Sequence
+from .types import Evaluation, Sequence, Transition
+
+Environment = AbstractEnvironment | AbstractHostEnvironment
 
 
-@jit
+class Experience(eqx.Module):
+    """What happened in a rollout, frame by frame."""
+
+    transitions: Transition  # leaves [rows, ...]
+    valid: Bool[Array, " rows"] | None  # None: every row, which then come from the host
+
+
 def evaluate(
-    env: AbstractEnvironment,
+    env: Environment,
     population: PyTree,
     episodes: int,
     *,
@@ -26,12 +38,58 @@ def evaluate(
     **Arguments:** `common` gives all members the same worlds, so that a ranking compares members
     and not luck; otherwise each member draws its own.
     """
+    if isinstance(env, AbstractHostEnvironment):
+        return collect(env, population, episodes, common=common, key=key)[0]
+    return _evaluate(env, population, episodes, common=common, key=key)
+
+
+def collect(
+    env: Environment,
+    population: PyTree,
+    episodes: int,
+    *,
+    wanted: Int[Array, ""] | int | None = None,
+    common: bool = True,
+    key: PRNGKeyArray,
+) -> tuple[Evaluation, Experience]:
+    """`evaluate`, and every transition that was met. A finished episode costs nothing more.
+
+    **Arguments:** of its `episodes` each member plays the first `wanted`; that number is data.
+    The others have no steps and a return of 0.
+    """
+    wanted = episodes if wanted is None else wanted
+    if isinstance(env, AbstractHostEnvironment):
+        return _collect_on_host(env, population, episodes, wanted, common, key)
+    return _collect(env, population, episodes, jnp.int32(wanted), common, key=key)
+
+
+def blank(env: Environment) -> Transition:
+    """A transition of this task, all zeros: its shapes and types."""
+    if isinstance(env, AbstractHostEnvironment):
+        obs = jnp.zeros(env.obs_size)
+        rewards = {name: jnp.float32(0.0) for name in env.signals}
+        return Transition(obs, jnp.zeros(env.action_size), rewards, obs, jnp.bool_(False))
+    _, first = jax.eval_shape(lambda: env.reset(key=jax.random.key(0)))
+    team = () if env.agents is None else (env.agents,)
+    first = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), first)
+    action = jnp.zeros((*team, env.action_size))
+    return Transition(first.obs, action, first.rewards, first.obs, first.terminated)
+
+
+def world_keys(pop: int, episodes: int, common: bool, *, key: PRNGKeyArray) -> PRNGKeyArray:
+    """A key per member and episode: what happens in the world, whoever acts."""
+    if common:
+        return jnp.broadcast_to(jax.random.split(key, episodes), (pop, episodes))
+    return jax.random.split(key, (pop, episodes))
+
+
+@jit
+def _evaluate(
+    env: AbstractEnvironment, population: PyTree, episodes: int, *, common: bool, key: PRNGKeyArray
+) -> Evaluation:
     pop = tree.size(population)
     world_key, policy_key = jax.random.split(key)
-    if common:
-        keys = jnp.broadcast_to(jax.random.split(world_key, episodes), (pop, episodes))
-    else:
-        keys = jax.random.split(world_key, (pop, episodes))
+    keys = world_keys(pop, episodes, common, key=world_key)
     if isinstance(env, AbstractSequenceTask) and getattr(population, "features_first", False):
         drawn = keys[:1] if common else keys
         # An episode resets with the first half of its world key: the same sequences either way.
@@ -76,6 +134,148 @@ def episode(
 
     *_, returns, steps = jax.lax.while_loop(ongoing, advance, start)
     return returns, steps
+
+
+@jit
+def _collect(
+    env: AbstractEnvironment,
+    population: PyTree,
+    episodes: int,
+    wanted: Int[Array, ""],
+    common: bool,
+    *,
+    key: PRNGKeyArray,
+) -> tuple[Evaluation, Experience]:
+    """All lanes `[pop, episodes]` take each step together, so that a row of the buffer is written
+    in place; a `vmap` of whole episodes would copy the buffer at every step."""
+    pop = tree.size(population)
+    world_key, policy_key = jax.random.split(key)
+    worlds = world_keys(pop, episodes, common, key=world_key)
+    reset_keys, step_keys = jnp.moveaxis(_each(jax.random.split)(worlds), 2, 0)
+    policy_keys = jax.random.split(policy_key, (pop, episodes))
+
+    states, first = _each(lambda key: env.reset(key=key))(reset_keys)
+    carries = _start(population, policy_keys)
+    active = jnp.broadcast_to(jnp.arange(episodes) < wanted, (pop, episodes))
+    shape = (env.max_steps, pop, episodes)
+    buffer = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape), x.dtype), blank(env))
+    valid = jnp.zeros(shape, bool)
+    start = (jnp.int32(0), states, first.obs, carries, active, buffer, valid)
+
+    def ongoing(loop):
+        t, *_, active, _, _ = loop
+        return jnp.any(active) & (t < env.max_steps)
+
+    def advance(loop):
+        t, states, obs, carries, active, buffer, valid = loop
+        actions, carries = _act(population, obs, carries)
+        keys = _each(lambda key: jax.random.fold_in(key, t))(step_keys)
+        states, step = _each(lambda s, a, key: env.step(s, a, key=key))(states, actions, keys)
+        row = Transition(obs, actions, step.rewards, step.obs, step.terminated)
+        buffer = jax.tree.map(lambda xs, x: xs.at[t].set(x), buffer, row)
+        valid = valid.at[t].set(active)
+        active = active & ~(step.terminated | step.truncated)
+        return t + 1, states, step.obs, carries, active, buffer, valid
+
+    *_, buffer, valid = jax.lax.while_loop(ongoing, advance, start)
+
+    def total(reward):
+        played = valid.reshape(valid.shape + (1,) * (reward.ndim - valid.ndim))
+        return jnp.sum(jnp.where(played, reward, jnp.zeros_like(reward)), axis=0)
+
+    steps = jnp.sum(valid.astype(jnp.int32), axis=0)
+    rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), buffer)
+    returns = jax.tree.map(total, buffer.rewards)
+    return Evaluation(returns, steps), Experience(rows, valid.reshape(-1))
+
+
+def _collect_on_host(
+    env: AbstractHostEnvironment,
+    population: PyTree,
+    episodes: int,
+    wanted: Int[Array, ""] | int,
+    common: bool,
+    key: PRNGKeyArray,
+) -> tuple[Evaluation, Experience]:
+    """The same with copies outside JAX: actions go there and time steps come back, once per step
+    for all lanes together."""
+    pop = tree.size(population)
+    leaves, structure = jax.tree.flatten(population)
+    arrays = [x if eqx.is_array(x) else None for x in leaves]
+    start, act = _programs(structure, tuple(None if eqx.is_array(x) else x for x in leaves))
+    seeds, carry = start(arrays, (pop, episodes), common, key)
+    copies = env.copies(pop * episodes)
+    active = np.tile(np.arange(episodes) < int(wanted), pop)
+    lost = np.zeros_like(active)  # the policy said NaN: it goes on with 0 and its return is NaN
+    obs = copies.reset(np.asarray(seeds).reshape(-1), active)
+    rows, played = [], []
+    for _ in range(env.max_steps):
+        action, carry = act(arrays, obs, carry)
+        action = np.asarray(action)
+        nan = np.isnan(action)
+        lost, action = lost | (active & nan.any(axis=1)), np.where(nan, np.float32(0.0), action)
+        step = copies.step(action, active)
+        rows.append((obs, action, step.rewards, step.obs, step.terminated))
+        played.append(active)
+        active = active & ~(step.terminated | step.truncated)
+        obs = step.obs
+        if not active.any():
+            break
+    valid = np.stack(played)
+    lanes = Transition(*jax.tree.map(lambda *xs: np.stack(xs), *rows))
+    returns = {}
+    for name, reward in lanes.rewards.items():
+        total = np.where(valid, reward, 0.0).sum(axis=0, dtype=np.float64)
+        total = np.where(lost, np.nan, total).astype(np.float32)
+        returns[name] = jnp.asarray(total.reshape(pop, episodes))
+    steps = jnp.asarray(valid.sum(axis=0, dtype=np.int32).reshape(pop, episodes))
+
+    def kept(x):
+        return x[valid].astype(np.float32 if x.dtype == np.float64 else x.dtype)
+
+    return Evaluation(returns, steps), Experience(jax.tree.map(kept, lanes), None)
+
+
+@functools.lru_cache(maxsize=64)
+def _programs(structure, rest: tuple):
+    """Compiled start and action of a population of this structure. `equinox.filter_jit` would
+    look at every leaf anew at every step, which takes longer than the step."""
+
+    def policies(arrays):
+        leaves = [x if y is None else y for x, y in zip(arrays, rest, strict=True)]
+        return jax.tree.unflatten(structure, leaves)
+
+    def start(arrays, shape, common, key):
+        world_key, policy_key = jax.random.split(key)
+        seeds = _each(jax.random.bits)(world_keys(*shape, common, key=world_key))
+        return seeds, _start(policies(arrays), jax.random.split(policy_key, shape))
+
+    def act(arrays, obs, carry):
+        pop = next(x.shape[0] for x in arrays if x is not None)
+        obs = obs.reshape(pop, -1, *obs.shape[1:])
+        actions, carry = _act(policies(arrays), obs, carry)
+        return actions.reshape(-1, *actions.shape[2:]), carry
+
+    return jax.jit(start, static_argnums=(1, 2)), jax.jit(act)
+
+
+def _each(function):
+    """`function` of one lane for lanes `[pop, episodes]`."""
+    return jax.vmap(jax.vmap(function))
+
+
+def _start(population: PyTree, keys: PRNGKeyArray) -> PyTree:
+    """Carries of all lanes; keys `[pop, episodes]`."""
+    return eqx.filter_vmap(lambda p, keys: jax.vmap(lambda key: p.start(key=key))(keys))(
+        population, keys
+    )
+
+
+def _act(population: PyTree, obs: Float[Array, "pop episodes obs"], carries: PyTree):
+    """Actions and carries of all lanes."""
+    return eqx.filter_vmap(
+        lambda p, obs, carries: jax.vmap(lambda x, carry: p(x, carry))(obs, carries)
+    )(population, obs, carries)
 
 
 def play_sequences(

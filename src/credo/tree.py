@@ -40,7 +40,7 @@ def stack(*members: PyTree) -> PyTree:
     differ in a hyper-parameter (γ, say) are one program; everything else must be equal."""
 
     def join(*xs):
-        if eqx.is_inexact_array_like(xs[0]) or eqx.is_array(xs[0]):
+        if eqx.is_array(xs[0]) or eqx.is_inexact_array_like(xs[0]):
             return jnp.stack([jnp.asarray(x) for x in xs])
         if any(x != xs[0] for x in xs):
             raise ValueError(f"cannot stack members that differ in {xs}: make it a float or equal")
@@ -66,6 +66,7 @@ class Layout(eqx.Module):
     leaf: Int[np.ndarray, " entries"]  # which leaf
     row: Int[np.ndarray, " entries"]  # which row of all rows; a vector has one entry per row
     place: Int[np.ndarray, " entries"]  # position within its leaf
+    matrix: Bool[np.ndarray, " entries"]  # whether that leaf is a matrix, not a vector
     sizes: Int[np.ndarray, " leaves"]
 
     @property
@@ -95,6 +96,7 @@ def ravel(
             ]
         ),
         place=np.concatenate([np.arange(x.size) for x in leaves]),
+        matrix=np.concatenate([np.full(x.size, x.ndim > 1) for x in leaves]),
         sizes=np.array([x.size for x in leaves]),
     )
     return vector, lambda vector: eqx.combine(unravel(vector), rest), layout

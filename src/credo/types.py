@@ -48,3 +48,13 @@ class Transition(eqx.Module):
     rewards: dict[str, Float[Array, "*rows"]]
     next_obs: Float[Array, "*rows obs"]
     terminated: Bool[Array, "*rows"]  # the task ended; after a time limit it did not
+
+
+class Batch(eqx.Module):
+    """A minibatch for a learner: transitions with the one reward it optimises."""
+
+    obs: Float[Array, "batch obs"]
+    action: Float[Array, "batch act"]
+    reward: Float[Array, " batch"]
+    next_obs: Float[Array, "batch obs"]
+    terminated: Bool[Array, " batch"]

@@ -26,7 +26,7 @@ NETWORKS = {
     "rnn": Recurrent(cell="rnn", hidden=2),
     "gru": Recurrent(cell="gru", hidden=2),
     "lstm": Recurrent(cell="lstm", hidden=2),
-    "mlp": MLP(width=2),
+    "mlp": MLP(hidden=(2,)),
 }
 ENVIRONMENTS = {
     "classification": SequenceClassification(depth=2, min_gap=0, max_gap=2),

@@ -1,4 +1,4 @@
-"""A shortened task is the whole one up to its n-th question."""
+"""A shortened task is the whole one up to its n-th question; a delayed one pays at the end."""
 
 import jax
 import jax.numpy as jnp
@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 
 from credo import rollout, tree
+from credo.environments.checks import check_environment
+from credo.environments.gymnasium import Gymnasium
+from credo.environments.probes import Meet
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
-from credo.environments.wrappers import Shortened
+from credo.environments.wrappers import (
+    DelayedHostReward,
+    DelayedReward,
+    Shortened,
+    delayed,
+)
 from credo.networks.mmu import MMU
 
 TASKS = {
@@ -62,3 +70,75 @@ def test_what_is_cut_off_is_not_played():
         Shortened(task, jnp.int32(1)), population, 8, key=jax.random.key(2)
     ).steps
     assert np.asarray(steps).tolist() == [[1] * 8]  # the first signal is at step 0
+
+
+def play(env, key, act):
+    """Rewards by signal `[time, ...]` of one episode, and its last time step."""
+    state, now = env.reset(key=key)
+    step, rewards = jax.jit(lambda state, t: env.step(state, act(t), key=key)), []
+    for t in range(env.max_steps):
+        state, now = step(state, jnp.float32(t))
+        rewards.append(now.rewards)
+        if now.terminated | now.truncated:
+            break
+    return {name: np.array([r[name] for r in rewards]) for name in env.signals}, now
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_delayed_task_pays_its_return_at_the_last_step(name):
+    task = TASKS[name]
+    plain, _ = play(task, KEYS[0], lambda t: jnp.cos(t)[None])
+    late, last = play(delayed(task), KEYS[0], lambda t: jnp.cos(t)[None])
+    assert last.terminated
+    assert any(np.count_nonzero(rewards) > 1 for rewards in plain.values())
+    for signal, rewards in plain.items():
+        assert len(late[signal]) == len(rewards)
+        assert not late[signal][:-1].any()
+        np.testing.assert_allclose(late[signal][-1], rewards.sum(), rtol=1e-6)
+
+
+def test_a_delayed_team_keeps_private_rewards():
+    task = Meet()
+    shape = (task.agents, task.action_size)
+    plain, _ = play(task, KEYS[1], lambda t: jnp.full(shape, 0.5))
+    late, _ = play(delayed(task), KEYS[1], lambda t: jnp.full(shape, 0.5))
+    for signal, rewards in plain.items():
+        assert late[signal].shape == rewards.shape
+        assert not late[signal][:-1].any()
+        np.testing.assert_allclose(late[signal][-1], rewards.sum(axis=0), rtol=1e-6)
+
+
+def test_a_delayed_task_keeps_the_contract():
+    task = delayed(TASKS["recall"])
+    assert isinstance(task, DelayedReward)
+    assert (task.signals, task.max_steps) == (task.env.signals, task.env.max_steps)
+    assert check_environment(task) == []
+    host = delayed(Gymnasium("Pendulum-v1", in_process=True))
+    assert isinstance(host, DelayedHostReward)
+    assert (host.obs_size, host.action_size, host.max_steps) == (3, 1, 200)
+    assert check_environment(host) == []
+
+
+def test_a_delayed_host_task_pays_its_return_at_the_last_step():
+    env = delayed(Gymnasium("broken:Tiny", max_episode_steps=9, in_process=True))
+    copies = env.copies(3)
+    assert env.copies(3) is copies
+    action, seeds = np.zeros((3, 1), np.float32), np.zeros(3, np.uint32)
+    everyone, first = np.ones(3, bool), np.arange(3) == 0
+    copies.reset(seeds, everyone)
+    for _ in range(2):
+        assert copies.step(action, first).rewards["reward"].tolist() == [0.0] * 3
+    paid = [copies.step(action, everyone).rewards["reward"].tolist() for _ in range(4)]
+    assert paid == [[0.0] * 3] * 3 + [[6 * 1.5, 0.0, 0.0]]  # six steps of 1.5
+    paid = [copies.step(action, ~first).rewards["reward"].tolist() for _ in range(2)]
+    assert paid == [[0.0] * 3, [0.0, 9.0, 9.0]]
+    copies.reset(seeds, first)  # nothing of the episode before is paid again
+    paid = [copies.step(action, first).rewards["reward"][0] for _ in range(6)]
+    assert paid == [0.0] * 5 + [9.0]
+
+
+def test_the_wrong_kind_of_task_is_refused():
+    with pytest.raises(ValueError, match=r"Gymnasium is no JAX task: use delayed\(env\)"):
+        DelayedReward(Gymnasium("Pendulum-v1"))
+    with pytest.raises(ValueError, match=r"Meet is no host task: use delayed\(env\)"):
+        DelayedHostReward(Meet())

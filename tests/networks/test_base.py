@@ -18,7 +18,7 @@ NETWORKS = {
     "rnn": Recurrent(cell="rnn", hidden=3),
     "gru": Recurrent(cell="gru", hidden=3),
     "lstm": Recurrent(cell="lstm", hidden=3),
-    "mlp": MLP(width=3, depth=2),
+    "mlp": MLP(hidden=(3, 3)),
 }
 
 
@@ -121,11 +121,10 @@ def test_configs_compare_by_value():
         (lambda: Recurrent(hidden=0), "hidden is 0"),
         (lambda: Recurrent(output_activation="relu"), "output_activation is 'relu'"),
         (lambda: Recurrent(initializer="uniform"), "initializer is 'uniform'"),
-        (lambda: MLP(width=0), "width is 0"),
-        (lambda: MLP(depth=0), "depth is 0"),
+        (lambda: MLP(hidden=(0,)), r"hidden\[0\] is 0"),
         (lambda: MLP(activation="swish"), "activation is 'swish'"),
         (lambda: MLP(output_activation="relu"), "output_activation is 'relu'"),
-        (lambda: MLP(initializer="uniform"), "initializer is 'uniform'"),
+        (lambda: MLP(initializer="flat"), "initializer is 'flat'"),
     ],
 )
 def test_impossible_networks_are_refused_with_a_reason(build, told):

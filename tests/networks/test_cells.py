@@ -215,7 +215,7 @@ def test_mlp_follows_the_equations(depth, activation):
             f"W_{layer}": (sizes[layer + 1], sizes[layer]),
             f"b_{layer}": (sizes[layer + 1],),
         }
-    net = MLP(width=h, depth=depth, activation=activation)
+    net = MLP(hidden=(h,) * depth, activation=activation)
     fresh = net.init(x, y, key=jax.random.key(0))
     assert {name: leaf.shape for name, leaf in fresh.weights.items()} == shapes
     w, inputs = weights_of(shapes), inputs_of(x)

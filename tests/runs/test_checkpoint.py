@@ -349,7 +349,8 @@ def fail_at(k: int, error: BaseException, patch: pytest.MonkeyPatch) -> list[str
 
         return call
 
-    for name in ("mkdir", "open", "write", "fsync", "rename", "replace", "unlink", "rmdir"):
+    changes = ("mkdir", "open", "write", "fsync", "link", "rename", "replace", "unlink", "rmdir")
+    for name in changes:
         patch.setattr(os, name, failing(name, getattr(os, name)))
     return failed
 

@@ -13,6 +13,7 @@ import sys
 import time
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -83,7 +84,7 @@ def test_a_run_is_a_folder_that_says_everything(straight):
     run = loop.Run(straight)
     assert run.algorithm == ALGORITHM
     assert run.config["seed"] == 0
-    assert run.config["budget"] == {"generations": BUDGET, "stop_at": None}
+    assert run.config["budget"] == {"generations": BUDGET, "frames": None, "stop_at": None}
     assert run.metrics["generation"].tolist() == list(range(1, BUDGET + 1))
     assert np.all(np.diff(run.metrics["frames"]) >= 10 * 4 * 3)  # depth 2, gaps of 1 or 2
     metadata = read_metadata(straight / "champion.safetensors")
@@ -116,10 +117,15 @@ def test_stopped_and_resumed_is_bit_for_bit_the_straight_run(straight, stopped):
     assert (stopped / "config.json").read_bytes() == (straight / "config.json").read_bytes()
 
 
-def test_resuming_a_finished_run_changes_nothing(straight):
+def test_resuming_a_finished_run_changes_nothing_and_says_so(straight, capsys):
     before = contents(straight)
-    assert resume(straight, callback=lambda *_: pytest.fail("trained")).path == straight
+    options = {"progress": True, "callback": lambda *_: pytest.fail("trained")}
+    assert resume(straight, **options).path == straight
     assert contents(straight) == before
+    assert capsys.readouterr().err == (
+        f"{straight} is finished: {BUDGET} of {BUDGET} generations; to go on give a larger "
+        "--generations or --frames\n"
+    )
 
 
 def test_a_larger_budget_is_the_run_that_had_it_from_the_start(straight, tmp_path):
@@ -138,6 +144,62 @@ def test_a_smaller_budget_is_refused(straight):
 def test_an_impossible_budget_is_refused(tmp_path):
     with pytest.raises(ValueError, match="generations is 0"):
         train(tmp_path / "run", generations=0)
+    with pytest.raises(ValueError, match="frames is -1"):
+        train(tmp_path / "run", frames=-1)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_budget_of_frames_stops_inside_a_dispatch(straight, tmp_path):
+    frames = loop.Run(straight).metrics["frames"]
+    last = 100  # of the generations; by then dispatches are longer than one
+    run = train(tmp_path / "run", generations=None, frames=int(frames[last - 1]))
+    assert run.metrics["generation"][-1] == last
+    resume(tmp_path / "run", frames=int(frames[last - 1]) + 1)
+    assert run.metrics["generation"][-1] == last + 1
+    resume(tmp_path / "run", generations=BUDGET)
+    assert contents(tmp_path / "run") == contents(straight)
+    assert loop.Run(run.path).config["budget"] == loop.Run(straight).config["budget"]
+
+
+def test_a_run_of_an_older_version_knows_no_frames_and_no_optax(stopped, straight):
+    config = json.loads((stopped / "config.json").read_text())
+    del config["budget"]["frames"], config["machine"]["versions"]["optax"]
+    (stopped / "config.json").write_text(json.dumps(config))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        resume(stopped)
+    assert contents(stopped) == contents(straight)
+
+
+def test_without_a_budget_neuroevolution_has_a_thousand_generations(tmp_path):
+    run = train(tmp_path / "run", generations=None, callback=until(1))
+    assert run.config["budget"] == {"generations": 1000, "frames": None, "stop_at": None}
+
+
+def test_the_memory_of_a_state_is_used_again():
+    state = loop._initial(ALGORITHM, jax.random.key(0))
+    before = jax.tree.leaves(eqx.filter(state, eqx.is_array))
+    budget = loop.Budget(generations=1)
+    state, _ = loop.play(ALGORITHM, state, jax.random.key(0), 0, 0, 1, budget)
+    assert all(leaf.is_deleted() for leaf in before)
+    assert np.isfinite(jax.tree.leaves(state.population)[0]).all()
+
+
+def test_an_early_interrupt_leaves_nothing_behind(tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    (tmp_path / "mine").mkdir()
+    monkeypatch.setattr(loop, "_initial", interrupted)
+    for path in (tmp_path / "new" / "folder" / "run", tmp_path / "mine"):
+        with pytest.raises(KeyboardInterrupt):
+            train(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine"]
+
+
+def test_no_warm_start_where_the_algorithm_has_none(straight, tmp_path):
+    with pytest.raises(loop.RunError, match="Neuroevolution cannot start from another run's"):
+        train(tmp_path / "run", warm_start=straight)
     assert not (tmp_path / "run").exists()
 
 

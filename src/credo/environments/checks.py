@@ -10,22 +10,27 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from ..types import Sequence, TimeStep
 from .base import AbstractEnvironment, AbstractSequenceTask
+from .host import AbstractCopies, AbstractHostEnvironment, HostStep, failure_of
 
 KEYS = 16  # episodes and sequences that are looked at
+HOST_STEPS = 2000  # the most that is played of one episode outside JAX
 
 
-def check_environment(env: AbstractEnvironment) -> list[str]:
-    """What is wrong with a JAX environment or sequence task, each with its fix; empty if nothing.
+def check_environment(env: AbstractEnvironment | AbstractHostEnvironment) -> list[str]:
+    """What is wrong with an environment or sequence task, each with its fix; empty if nothing.
 
-    Plays 16 episodes of random actions, at most `2 * max_steps` steps each. Later checks need
-    what earlier ones established, so mend what is listed and check again. What the environment
+    Plays 16 episodes of random actions, at most `2 * max_steps` steps each; of a task outside
+    JAX (`Gymnasium("Hopper-v5")`) two episodes, each of them twice. Later checks need
+    what earlier ones established, so mend what is listed and check again. What a JAX environment
     itself raises, or JAX about its code, is not caught: it says more than a line here could.
     """
+    if isinstance(env, AbstractHostEnvironment):
+        return _check_host(env)
     if not isinstance(env, AbstractEnvironment):
         return [
             f"{type(env).__name__} is not an environment of ours: derive it from "
             "credo.environments.base.AbstractEnvironment, or AbstractSequenceTask for a "
-            "labelled sequence"
+            "labelled sequence; name a Gymnasium environment as Gymnasium(id)"
         ]
     stages: list[Callable[..., list[str]]] = [_spec, _reset_and_step, _repeatable, _episodes]
     if isinstance(env, AbstractSequenceTask):
@@ -37,7 +42,7 @@ def check_environment(env: AbstractEnvironment) -> list[str]:
     return []
 
 
-def _spec(env: AbstractEnvironment) -> list[str]:
+def _spec(env: AbstractEnvironment | AbstractHostEnvironment) -> list[str]:
     problems = [
         f"{name} is {getattr(env, name)!r}: it must be a Python int of at least 1"
         for name in ("obs_size", "action_size", "max_steps", "agents")
@@ -49,8 +54,7 @@ def _spec(env: AbstractEnvironment) -> list[str]:
         problems.append(f"signals is {names!r}: it must be a tuple of one or more names")
     elif len(set(names)) < len(names):
         problems.append(f"signals is {names!r}: a name occurs twice; give each reward its own")
-    low, high = env.obs_range
-    if not low < high:
+    if isinstance(env, AbstractEnvironment) and not env.obs_range[0] < env.obs_range[1]:
         problems.append(f"obs_range is {env.obs_range}: it must be (least, largest)")
     return problems
 
@@ -306,6 +310,89 @@ def _sequence_reward(task: AbstractSequenceTask) -> list[str]:
                 "elementwise, without sums over the batch"
             )
     return problems
+
+
+def _check_host(env: AbstractHostEnvironment) -> list[str]:
+    """Two copies play two seeds, then the same with the seeds exchanged."""
+    failure = failure_of(lambda: env.copies(2))
+    problems = [str(failure)] if failure else _spec(env)
+    if problems:
+        return problems
+    copies, problems, episodes = env.copies(2), [], []
+
+    def play() -> None:
+        for seeds in ([1, 2], [2, 1]):
+            episodes.append(_play_host(env, copies, np.array(seeds, np.uint32), problems))
+
+    failure = failure_of(play)
+    if failure:
+        problems.append(str(failure))
+    if problems:
+        return list(dict.fromkeys(problems))
+    (a, b), (c, d) = episodes
+    if a != d or b != c:
+        problems.append(
+            "the same seed gave two different episodes: draw everything from self.np_random, which "
+            "reset(seed=seed) seeds through super().reset(seed=seed), and let reset set all state"
+        )
+    return problems
+
+
+def _play_host(
+    env: AbstractHostEnvironment, copies: AbstractCopies, seeds: np.ndarray, problems: list[str]
+) -> list[bytes]:
+    """One episode in every copy, all with the same random actions: all that was seen.
+
+    What is wrong is added to `problems`; at the first wrong step it stops.
+    """
+    random, active = np.random.default_rng(0), np.ones(copies.n, bool)
+    obs = copies.reset(seeds, active)
+    problems += _numbers("reset: obs", obs, (copies.n, env.obs_size), np.float32)
+    seen = [obs[i].tobytes() for i in range(copies.n)] if not problems else []
+    for _ in range(min(env.max_steps, HOST_STEPS)):
+        if problems or not active.any():
+            return seen
+        action = np.clip(random.uniform(-1.5, 1.5, env.action_size), -1.0, 1.0)
+        step = copies.step(np.tile(np.float32(action), (copies.n, 1)), active)
+        problems += _host_step(env, step, active)
+        for i in np.flatnonzero(active) if not problems else ():
+            rewards = [step.rewards[name][i].tobytes() for name in env.signals]
+            seen[i] += b"".join([step.obs[i].tobytes(), *rewards])
+        active = active & ~(step.terminated | step.truncated)
+    if active.any() and env.max_steps <= HOST_STEPS:
+        problems.append(
+            f"an episode had not ended after max_steps, {env.max_steps}: set truncated when the "
+            "clock runs out"
+        )
+    return seen
+
+
+def _host_step(env: AbstractHostEnvironment, step: HostStep, active: np.ndarray) -> list[str]:
+    n = len(active)
+    problems = _numbers("step: obs", step.obs, (n, env.obs_size), np.float32, active)
+    if set(step.rewards) != set(env.signals):
+        problems.append(
+            f"step: rewards are {sorted(step.rewards)} but signals names {sorted(env.signals)}: "
+            "return exactly those, every time"
+        )
+    for name, reward in step.rewards.items():
+        problems += _numbers(f"step: reward {name!r}", reward, (n,), np.floating, active)
+    for name in ("terminated", "truncated"):
+        problems += _numbers(f"step: {name}", getattr(step, name), (n,), np.bool_)
+    return problems
+
+
+def _numbers(
+    what: str, x: np.ndarray, shape: tuple[int, ...], dtype: type, active: np.ndarray | None = None
+) -> list[str]:
+    """Problems of one NumPy array whose `active` rows should be finite."""
+    name = "a floating type" if dtype is np.floating else np.dtype(dtype).name
+    if not isinstance(x, np.ndarray) or x.shape != shape or not np.issubdtype(x.dtype, dtype):
+        given = f"{x.dtype}{list(x.shape)}" if isinstance(x, np.ndarray) else type(x).__name__
+        return [f"{what} is {given}: return a NumPy array of {name} and shape {list(shape)}"]
+    if not np.isfinite(x if active is None else x[active]).all():
+        return [f"{what} has NaN or inf: guard the division, root or logarithm it is from"]
+    return []
 
 
 def _equal(a: PyTree, b: PyTree) -> bool:

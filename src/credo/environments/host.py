@@ -2,16 +2,34 @@
 
 import abc
 import dataclasses
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
 
+class EnvironmentFailure(RuntimeError):
+    """An environment raised, ended its process, hung, or returned what it must not.
+
+    The message names the environment, the copy, the step and the seed, and says what to do.
+    """
+
+
+def failure_of(play: Callable[[], Any]) -> EnvironmentFailure | None:
+    """How an environment fails while it is played, for checks that list what is wrong."""
+    try:
+        play()
+    except EnvironmentFailure as failure:
+        return failure
+    return None
+
+
 @dataclasses.dataclass
 class HostStep:
-    """What `n` copies say after one step. Rows of copies that were not active mean nothing."""
+    """What `n` copies say after one step, in arrays of its own that no later step writes to. Rows
+    of copies that were not active are finite and mean nothing."""
 
     obs: Float[np.ndarray, "n obs"]
     rewards: dict[str, Float[np.ndarray, " n"]]
@@ -32,9 +50,7 @@ class AbstractCopies(abc.ABC):
         """
 
     @abc.abstractmethod
-    def step(
-        self, actions: Float[np.ndarray, "n act"], active: Bool[np.ndarray, " n"]
-    ) -> HostStep:
+    def step(self, actions: Float[np.ndarray, "n act"], active: Bool[np.ndarray, " n"]) -> HostStep:
         """One step of every active copy; the others cost nothing. Actions lie in [-1, 1]."""
 
 

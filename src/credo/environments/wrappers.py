@@ -1,10 +1,13 @@
 """Tasks made of other tasks."""
 
+import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
-from ..types import Sequence
-from .base import AbstractSequenceTask
+from ..types import Sequence, TimeStep
+from .base import AbstractEnvironment, AbstractSequenceTask
+from .host import AbstractCopies, AbstractHostEnvironment, HostStep
 
 
 class Shortened(AbstractSequenceTask):
@@ -36,3 +39,124 @@ class Shortened(AbstractSequenceTask):
 
     def reward(self, answer, target, scored, perfect):
         return self.task.reward(answer, target, scored, perfect)
+
+
+def delayed(
+    env: AbstractEnvironment | AbstractHostEnvironment,
+) -> "DelayedReward | DelayedHostReward":
+    """The hard variant of a task: the whole return is paid at the last step of the episode."""
+    if isinstance(env, AbstractHostEnvironment):
+        return DelayedHostReward(env)
+    return DelayedReward(env)
+
+
+class DelayedState(eqx.Module):
+    inner: PyTree
+    earned: dict[str, Array]  # since the episode began
+
+
+class DelayedReward(AbstractEnvironment):
+    """A JAX task that pays the sum of every reward signal at the last step, and 0 before."""
+
+    env: AbstractEnvironment
+
+    def __check_init__(self):
+        if not isinstance(self.env, AbstractEnvironment):
+            raise ValueError(f"{type(self.env).__name__} is no JAX task: use delayed(env)")
+
+    @property
+    def obs_size(self) -> int:
+        return self.env.obs_size
+
+    @property
+    def action_size(self) -> int:
+        return self.env.action_size
+
+    @property
+    def max_steps(self) -> int:
+        return self.env.max_steps
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        return self.env.signals
+
+    @property
+    def agents(self) -> int | None:
+        return self.env.agents
+
+    @property
+    def obs_range(self) -> tuple[float, float]:
+        return self.env.obs_range
+
+    def reset(self, *, key: PRNGKeyArray) -> tuple[DelayedState, TimeStep]:
+        inner, first = self.env.reset(key=key)
+        return DelayedState(inner, first.rewards), first  # they are 0
+
+    def step(
+        self, state: DelayedState, action: Array, *, key: PRNGKeyArray
+    ) -> tuple[DelayedState, TimeStep]:
+        inner, now = self.env.step(state.inner, action, key=key)
+        earned = {name: state.earned[name] + reward for name, reward in now.rewards.items()}
+        ended = now.terminated | now.truncated
+        paid = {name: jnp.where(ended, sum_, 0.0) for name, sum_ in earned.items()}
+        now = TimeStep(now.obs, paid, now.terminated, now.truncated, now.active)
+        return DelayedState(inner, earned), now
+
+
+class DelayedHostReward(AbstractHostEnvironment):
+    """The same for a task outside JAX. Its copies are those of `env`: play one at a time."""
+
+    env: AbstractHostEnvironment
+
+    def __check_init__(self):
+        if not isinstance(self.env, AbstractHostEnvironment):
+            raise ValueError(f"{type(self.env).__name__} is no host task: use delayed(env)")
+
+    @property
+    def obs_size(self) -> int:
+        return self.env.obs_size
+
+    @property
+    def action_size(self) -> int:
+        return self.env.action_size
+
+    @property
+    def max_steps(self) -> int:
+        return self.env.max_steps
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        return self.env.signals
+
+    @property
+    def agents(self) -> int | None:
+        return self.env.agents
+
+    def copies(self, n: int) -> "DelayedCopies":
+        inner = self.env.copies(n)
+        if (self, n) not in _DELAYED or _DELAYED[self, n].inner is not inner:
+            _DELAYED[self, n] = DelayedCopies(inner, self.signals)
+        return _DELAYED[self, n]
+
+
+class DelayedCopies(AbstractCopies):
+    def __init__(self, inner: AbstractCopies, signals: tuple[str, ...]):
+        self.inner, self.n = inner, inner.n
+        self._earned = {name: np.zeros(inner.n) for name in signals}
+
+    def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
+        for earned in self._earned.values():
+            earned[active] = 0.0
+        return self.inner.reset(seeds, active)
+
+    def step(self, actions: np.ndarray, active: np.ndarray) -> HostStep:
+        now = self.inner.step(actions, active)
+        ended = now.terminated | now.truncated
+        paid = {}
+        for name, earned in self._earned.items():
+            np.add(earned, now.rewards[name], out=earned, where=active)
+            paid[name] = np.where(ended & active, earned, 0.0)
+        return HostStep(now.obs, paid, now.terminated, now.truncated)
+
+
+_DELAYED: dict[tuple[DelayedHostReward, int], DelayedCopies] = {}

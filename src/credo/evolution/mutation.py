@@ -34,6 +34,7 @@ class MatrixMutation(AbstractMutation):
     fraction: float = 0.1  # share of a matrix's entries that is hit, in [0, 1]
     up_to_fraction: bool = eqx.field(static=True, default=False)
     """Draw the share anew for each matrix, uniformly up to `fraction` and at least one entry."""
+    vectors: bool = eqx.field(static=True, default=True)  # hit biases and start memory too
     strength: float = 0.1  # std of the noise, relative to the weight
     floor: float = 0.0  # std of further noise, absolute, so that small weights can move
     super_probability: float = 0.0  # share of hits that are super, in [0, 1]
@@ -55,6 +56,8 @@ class MatrixMutation(AbstractMutation):
         gates = jax.random.bernoulli(gate_key, self.probability, layout.sizes.shape)
         gate = gates[0] if self.gate == "genome" else gates[layout.leaf]
         hit = gate & self.hits(layout, key=hit_key)
+        if not self.vectors:
+            hit = hit & layout.matrix
         return unravel(jnp.where(hit, self.moved(w, key=move_key), w))
 
     def hits(self, layout: tree.Layout, *, key: PRNGKeyArray) -> Bool[Array, " entries"]:

@@ -2,6 +2,7 @@
 know what a genome is."""
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -22,6 +23,8 @@ def ranking(fitness: Float[Array, " pop"]) -> Int[Array, " pop"]:
 
 
 class AbstractSelection(eqx.Module):
+    sees_fitness: ClassVar[bool] = True  # False: nobody is better, and elites are drawn too
+
     @abc.abstractmethod
     def __call__(
         self, fitness: Float[Array, " pop"], n: int, *, key: PRNGKeyArray
@@ -56,6 +59,15 @@ class Truncation(AbstractSelection):
     def __call__(self, fitness, n, *, key):
         best = ranking(fitness)[: max(1, round(self.fraction * fitness.shape[0]))]
         return best[jax.random.randint(key, (n,), 0, best.shape[0])]
+
+
+class Uniform(AbstractSelection):
+    """Any member, `n` times: fitness is not looked at. What selection is measured against."""
+
+    sees_fitness: ClassVar[bool] = False
+
+    def __call__(self, fitness, n, *, key):
+        return jax.random.randint(key, (n,), 0, fitness.shape[0])
 
 
 def repeated(index: Int[Array, " n"]) -> Bool[Array, " n"]:

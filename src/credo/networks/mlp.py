@@ -1,9 +1,11 @@
-"""Feed-forward policy: the memoryless baseline."""
+"""Feed-forward networks: the actor of learners, and the memoryless baseline of evolution."""
 
 import itertools
 from typing import ClassVar, Literal
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .. import require
@@ -17,33 +19,37 @@ from .base import (
     to_action,
 )
 
+NORMALIZATIONS = ("none", "before", "after")
+EPSILON = 1e-6  # of LayerNorm, relative to the variance
+
 
 class MLP(AbstractNetwork):
     """Config of a multi-layer perceptron."""
 
-    width: int = eqx.field(static=True, default=20)  # units per hidden layer
-    depth: int = eqx.field(static=True, default=1)  # hidden layers, at least 1
+    hidden: tuple[int, ...] = eqx.field(static=True, default=(20,))  # units of each hidden layer
     activation: str = eqx.field(static=True, default="tanh")  # of the hidden layers
+    normalization: Literal["none", "before", "after"] = eqx.field(static=True, default="none")
+    """LayerNorm of the hidden layers, before their activation or after it."""
     output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="tanh")
-    initializer: str = eqx.field(static=True, default="normal")  # normal, fan_in or kaiming
+    output_scale: float = eqx.field(static=True, default=1.0)  # of the fresh output layer
+    initializer: str = eqx.field(static=True, default="normal")
+    """normal, fan_in, kaiming, or uniform: U(±fan_in^-1/2), what PyTorch does."""
 
     def __check_init__(self):
-        require.at_least("width", self.width, 1)
-        require.at_least("depth", self.depth, 1)
-        require.choice("activation", self.activation, ACTIVATIONS)
+        _check(self)
         require.choice("output_activation", self.output_activation, ("sigmoid", "tanh"))
-        require.choice("initializer", self.initializer, INITIALIZERS)
 
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> "MLPPolicy":
-        sizes = (obs_size, *[self.width] * self.depth, action_size)
-        shapes: dict[str, tuple[int, ...]] = {}
-        for layer, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
-            shapes |= {f"W_{layer}": (fan_out, fan_in), f"b_{layer}": (fan_out,)}
-        return MLPPolicy(draw(shapes, self.initializer, key=key), self)
+        sizes = (obs_size, *self.hidden, action_size)
+        weights = draw_layers(sizes, self.initializer, self.normalization, key=key)
+        for name in (f"W_{len(self.hidden)}", f"b_{len(self.hidden)}"):
+            weights[name] = self.output_scale * weights[name]
+        return MLPPolicy(weights, self)
 
 
 class MLPPolicy(AbstractPolicy):
-    """Weights by name: `W_l` and `b_l` of each layer l. The carry is empty."""
+    """Weights by name: `W_l` and `b_l` of each layer l, `g_l` and `s_l` (gain and shift) of its
+    LayerNorm. The carry is empty."""
 
     features_first: ClassVar[bool] = True
 
@@ -54,9 +60,130 @@ class MLPPolicy(AbstractPolicy):
         return ()
 
     def __call__(self, obs, carry):
-        x = obs
-        for layer in range(self.config.depth + 1):
-            last = layer == self.config.depth
-            φ = ACTIVATIONS[self.config.output_activation if last else self.config.activation]
-            x = φ(matvec(self.weights[f"W_{layer}"], x) + self.weights[f"b_{layer}"])
-        return to_action(x, self.config.output_activation), carry
+        return self.action(self.output(self.features(obs))), carry
+
+    def features(self, obs: Float[Array, "obs *batch"]) -> Float[Array, "units *batch"]:
+        """The last hidden layer."""
+        c = self.config
+        return hidden_layers(self.weights, obs, len(c.hidden), c.activation, c.normalization)
+
+    def output(self, features: Float[Array, "units *batch"]) -> Float[Array, "act *batch"]:
+        """The last layer, before its activation."""
+        return linear(self.weights, len(self.config.hidden), features)
+
+    def action(self, output: Float[Array, "act *batch"]) -> Float[Array, "act *batch"]:
+        """The output, before its activation, as an action in [-1, 1]."""
+        kind = self.config.output_activation
+        return to_action(ACTIVATIONS[kind](output), kind)
+
+
+class Critic(eqx.Module):
+    """Config of an action-value network Q(s, a)."""
+
+    hidden: tuple[int, ...] = eqx.field(static=True, default=(256, 256))  # units of each layer
+    branches: tuple[int, ...] = eqx.field(static=True, default=())
+    """Units of two layers of their own for state and action, whose outputs are joined; none: state
+    and action go into the first hidden layer together."""
+    activation: str = eqx.field(static=True, default="relu")
+    normalization: Literal["none", "before", "after"] = eqx.field(static=True, default="none")
+    output_scale: float = eqx.field(static=True, default=1.0)  # of the fresh output layer
+    initializer: str = eqx.field(static=True, default="uniform")  # as in MLP
+
+    def __check_init__(self):
+        _check(self)
+        if len(self.branches) not in (0, 2):
+            raise ValueError(f"branches are {self.branches}: give two sizes (state, action) or ()")
+
+    def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> "CriticNetwork":
+        layers_key, *branch_keys = jax.random.split(key, 3)
+        weights, inputs = {}, obs_size + action_size
+        if self.branches:
+            inputs = sum(self.branches)
+            fans = (("S", obs_size), ("A", action_size))
+            for (name, fan_in), units, k in zip(fans, self.branches, branch_keys, strict=True):
+                layer = draw_layers((fan_in, units), self.initializer, key=k)
+                weights |= {f"{kind}_{name}": layer[f"{kind}_0"] for kind in "Wb"}
+        sizes = (inputs, *self.hidden, 1)
+        weights |= draw_layers(sizes, self.initializer, self.normalization, key=layers_key)
+        for name in (f"W_{len(self.hidden)}", f"b_{len(self.hidden)}"):
+            weights[name] = self.output_scale * weights[name]
+        return CriticNetwork(weights, self, action_size)
+
+
+class CriticNetwork(eqx.Module):
+    """Weights by name as in `MLPPolicy`; `W_S`, `b_S` and `W_A`, `b_A` of the branches."""
+
+    weights: dict[str, Float[Array, "..."]]
+    config: Critic = eqx.field(static=True)
+    action_size: int = eqx.field(static=True)
+
+    def __call__(
+        self, obs: Float[Array, "obs *batch"], action: Float[Array, "act *batch"]
+    ) -> Float[Array, "*batch"]:
+        c = self.config
+        if c.branches:
+            φ = ACTIVATIONS[c.activation]
+            obs, action = (
+                φ(linear(self.weights, name, x)) for name, x in (("S", obs), ("A", action))
+            )
+        x = jnp.concatenate([obs, action])
+        x = hidden_layers(self.weights, x, len(c.hidden), c.activation, c.normalization)
+        return linear(self.weights, len(c.hidden), x)[0]
+
+
+def draw_layers(
+    sizes: tuple[int, ...], initializer: str, normalization: str = "none", *, key: PRNGKeyArray
+) -> dict[str, Float[Array, "..."]]:
+    """Fresh layers between these sizes; LayerNorms start at gain 1 and shift 0."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    bounds: dict[str, float] = {}
+    for layer, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
+        shapes |= {f"W_{layer}": (fan_out, fan_in), f"b_{layer}": (fan_out,)}
+        bounds |= {f"W_{layer}": fan_in**-0.5, f"b_{layer}": fan_in**-0.5}
+    weights = draw(shapes, "normal" if initializer == "uniform" else initializer, key=key)
+    if initializer == "uniform":
+        # The distribution function of a Gaussian draw is uniform.
+        weights = {
+            name: bounds[name] * (2.0 * jax.scipy.stats.norm.cdf(w) - 1.0)
+            for name, w in weights.items()
+        }
+    if normalization != "none":
+        for layer, units in enumerate(sizes[1:-1]):
+            weights |= {f"g_{layer}": jnp.ones(units), f"s_{layer}": jnp.zeros(units)}
+    return weights
+
+
+def hidden_layers(weights, x: Array, depth: int, activation: str, normalization: str) -> Array:
+    φ = ACTIVATIONS[activation]
+    for layer in range(depth):
+        x = linear(weights, layer, x)
+        if normalization == "before":
+            x = normalize(weights, layer, x)
+        x = φ(x)
+        if normalization == "after":
+            x = normalize(weights, layer, x)
+    return x
+
+
+def linear(weights, layer: int | str, x: Float[Array, "in *batch"]) -> Float[Array, "out *batch"]:
+    return matvec(weights[f"W_{layer}"], x) + _like(weights[f"b_{layer}"], x)
+
+
+def normalize(weights, layer: int, x: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
+    """LayerNorm (Ba et al. 2016) over the features."""
+    x = x - jnp.mean(x, axis=0, keepdims=True)
+    scale = jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=0, keepdims=True) + EPSILON)
+    return _like(weights[f"g_{layer}"], x) * (x * scale) + _like(weights[f"s_{layer}"], x)
+
+
+def _like(b: Float[Array, "n *batch"], x: Array) -> Array:
+    """A vector of one network for a batch of inputs."""
+    return b.reshape(b.shape + (1,) * (x.ndim - b.ndim))
+
+
+def _check(config: MLP | Critic) -> None:
+    for i, units in enumerate((*config.hidden, *getattr(config, "branches", ()))):
+        require.at_least(f"hidden[{i}]", units, 1)
+    require.choice("activation", config.activation, ACTIVATIONS)
+    require.choice("normalization", config.normalization, NORMALIZATIONS)
+    require.choice("initializer", config.initializer, (*INITIALIZERS, "uniform"))

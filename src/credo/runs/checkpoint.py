@@ -5,7 +5,8 @@ A checkpoint is a folder named by its generation:
     checkpoints/00000120/
       state.safetensors   every array leaf, named by its path in the tree
       counters.json       plain numbers and strings
-      COMMIT              size and SHA-256 of the two; written last
+      replay0-….safetensors, …   rows of a replay buffer; unchanged ones are hard links
+      COMMIT              size and SHA-256 of each; written last
 
 It is written under another name and renamed when it is on the disk, so a process may be killed at
 any moment. Nothing read here can execute code. `export_policy` and `import_policy` do the same
@@ -33,8 +34,11 @@ from jax.tree_util import keystr, tree_flatten_with_path
 from jaxtyping import Array, PyTree
 from safetensors import SafetensorError, safe_open
 
+from . import segments
+
 STATE, COUNTERS, COMMIT = "state.safetensors", "counters.json", "COMMIT"
-KEYS, CHECKSUM = "credo.keys", "credo.sha256"  # our entries in a file's metadata
+# Our entries in a file's metadata.
+KEYS, CHECKSUM, REPLAY = "credo.keys", "credo.sha256", "credo.replay"
 DTYPES = {
     np.dtype(dtype): code
     for dtype, code in {
@@ -81,9 +85,13 @@ def save(
     not written: `load` takes them from its `like`. `counters` holds numbers, strings, lists and
     dicts; integers of any size and floats come back exactly.
 
+    The rows of a `credo.replay.Replay` that an older checkpoint has are not written again but
+    linked (see `segments`).
+
     Of the older checkpoints the newest intact ones stay, `keep` with this one, and the rest are
-    removed once this one is safe; to know them, those that stay are read once. An intact
-    checkpoint of the same generation is left alone, a damaged one replaced.
+    removed once this one is safe; to know them, those that stay are read once, without the rows
+    that this process wrote or read before. An intact checkpoint of the same generation is left
+    alone, a damaged one replaced.
 
     Raises `CheckpointError` if a leaf cannot be stored or the disk is full or fails; older
     checkpoints are then intact and no half-written one is left.
@@ -95,14 +103,22 @@ def save(
     directory = Path(directory)
     folder = directory / f"{generation:08d}"
     leaves, keys = _leaves(state)
-    header = _header(leaves, {KEYS: json.dumps(keys)})
+    rings = segments.rings(state)
+    for name in [name for ring in rings for name in ring.leaves]:
+        del leaves[name]  # it goes to files of its own
+    metadata = {KEYS: json.dumps(keys)} | ({REPLAY: segments.describe(rings)} if rings else {})
+    header = _header(leaves, metadata)
     text = _counters_text(counters)
+    parts = segments.parts(rings)
+    with _explained(f"cannot read {directory}", directory):
+        there = _intact_parts(directory, parts)
     needed = len(header) + _size(leaves) + len(text)
+    needed += sum(_size(rows) for name, rows in parts.items() if name not in there)
     with _explained(f"cannot save checkpoint {folder}", directory, needed):
         directory.mkdir(parents=True, exist_ok=True)
         _remove_unfinished(directory)
-        if not folder.exists() or damage(folder):
-            _write_folder(folder, _chunks(header, leaves), text)
+        if not folder.exists() or damage(folder, reread=False):
+            _write_folder(folder, _chunks(header, leaves), text, parts, there)
     with _explained(f"{folder} is saved, but an older checkpoint cannot be removed", directory):
         _remove_beyond(keep, folder)
     return folder
@@ -139,8 +155,9 @@ def load(directory: Path, like: PyTree, *, generation: int | None = None) -> Che
                 stacklevel=2,
             )
         metadata, arrays = _read(folder / STATE)
-        state = _fit(folder / STATE, like, arrays, metadata)
         with _explained(f"cannot read {folder}", folder):
+            arrays |= segments.stored(folder, metadata.get(REPLAY, "[]"))
+            state = _fit(folder / STATE, like, arrays, metadata)
             counters = json.loads((folder / COUNTERS).read_text())
         return Checkpoint(int(folder.name), state, counters, folder)
     reasons = "".join(f"\n  {name}: {why}" for name, why in damaged.items())
@@ -150,8 +167,12 @@ def load(directory: Path, like: PyTree, *, generation: int | None = None) -> Che
     )
 
 
-def damage(folder: Path) -> str | None:
-    """What is wrong with the checkpoint in `folder`; None if every byte is as it was written."""
+def damage(folder: Path, *, reread: bool = True) -> str | None:
+    """What is wrong with the checkpoint in `folder`; None if every byte is as it was written.
+
+    Without `reread`, rows of a replay buffer that this process wrote or read before are taken to
+    be as they were if their file was not touched since.
+    """
     try:
         names = set(os.listdir(folder))
         if not names:
@@ -162,6 +183,8 @@ def damage(folder: Path) -> str | None:
             return f"{' and '.join(sorted(missing))} is missing"
         committed = (folder / COMMIT).read_bytes()
         found = {name: _fingerprint(folder / name) for name in (STATE, COUNTERS)}
+        for name in filter(segments.NAME.fullmatch, names):
+            found[name] = _part_fingerprint(folder / name, reread=reread)
     except OSError as error:
         return f"it cannot be read: {error}"
     if committed == _commit_text(int(folder.name), found):
@@ -252,7 +275,10 @@ def _leaves(tree: PyTree) -> tuple[dict[str, Any], dict[str, str]]:
 
 
 def _fit(
-    path: Path, like: PyTree, arrays: dict[str, np.ndarray], metadata: Mapping[str, str]
+    path: Path,
+    like: PyTree,
+    arrays: dict[str, np.ndarray | segments.Stored],
+    metadata: Mapping[str, str],
 ) -> PyTree:
     """`like` with the arrays of the file in the places of its own; `arrays` is emptied."""
     keys = json.loads(metadata[KEYS])
@@ -266,7 +292,8 @@ def _fit(
 
     def leaf(name: str) -> Array:
         data = arrays.pop(name)
-        array = jnp.array(data)
+        # One leaf at a time: a buffer may fill most of the memory.
+        array = jnp.array(_read_rows(data) if isinstance(data, segments.Stored) else data)
         if array.dtype != data.dtype:
             raise CheckpointError(f"{path}: {name} is {_describe(data)}: set jax_enable_x64")
         return jax.random.wrap_key_data(array, impl=keys[name]) if name in keys else array
@@ -318,7 +345,7 @@ def _header(leaves: Mapping[str, Any], metadata: Mapping[str, str]) -> bytes:
 def _chunks(header: bytes, leaves: Mapping[str, Any]) -> Iterator[bytes | memoryview]:
     yield header
     for leaf in leaves.values():
-        yield _bytes(leaf)
+        yield from leaf.pieces() if isinstance(leaf, segments.Rows) else [_bytes(leaf)]
 
 
 def _checksum(metadata: Mapping[str, str], leaves: Mapping[str, Any]) -> str:
@@ -341,7 +368,7 @@ def _counters_text(counters: dict[str, Any]) -> bytes:
     return text.encode()
 
 
-def _read(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+def _read(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
     """The metadata and the arrays of a file."""
     try:
         with (
@@ -354,7 +381,14 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
         raise CheckpointError(f"{path} is damaged: {error}") from error
 
 
-def _read_export(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+def _read_rows(stored: segments.Stored) -> np.ndarray:
+    try:
+        return stored.read()
+    except (SafetensorError, ValueError) as error:
+        raise CheckpointError(f"the replay buffer's {stored.name} is damaged: {error}") from error
+
+
+def _read_export(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
     metadata, arrays = _read(path)
     checksum = metadata.pop(CHECKSUM, None)
     if checksum is None or KEYS not in metadata:
@@ -400,11 +434,18 @@ def _remove_beyond(keep: int, newest: Path) -> None:
     for folder in older if len(older) >= keep else []:
         if intact == keep:
             _remove(folder)
-        elif damage(folder) is None:
+        elif damage(folder, reread=False) is None:
             intact += 1
 
 
-def _write_folder(folder: Path, state: Iterable[bytes | memoryview], counters: bytes) -> None:
+def _write_folder(
+    folder: Path,
+    state: Iterable[bytes | memoryview],
+    counters: bytes,
+    parts: Mapping[str, Mapping[str, segments.Rows]],
+    there: Mapping[str, Path],
+) -> None:
+    """`parts` are the files of replay buffers, and `there` says which of them are written."""
     partial = _beside(folder, "partial")
     try:
         partial.mkdir()
@@ -412,6 +453,10 @@ def _write_folder(folder: Path, state: Iterable[bytes | memoryview], counters: b
             STATE: _write(partial / STATE, state),
             COUNTERS: _write(partial / COUNTERS, [counters]),
         }
+        for name, rows in parts.items():
+            if not (name in there and _link(there[name], partial / name)):
+                _write_part(partial / name, rows)
+            found[name] = _part_fingerprint(partial / name, reread=False)
         _write(partial / COMMIT, [_commit_text(int(folder.name), found)])
         _sync(partial)
         if folder.exists():
@@ -420,6 +465,55 @@ def _write_folder(folder: Path, state: Iterable[bytes | memoryview], counters: b
         _sync(folder.parent)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+# Files of a replay buffer's rows. They are never changed, so one look at each is enough.
+
+_seen: dict[tuple[int, ...], dict[str, Any]] = {}  # fingerprints, by what tells files apart
+
+
+def _identity(path: Path) -> tuple[int, ...]:
+    status = os.stat(path)
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _part_fingerprint(path: Path, *, reread: bool) -> dict[str, Any]:
+    identity = _identity(path)
+    if reread or identity not in _seen:
+        _seen[identity] = _fingerprint(path)
+    return _seen[identity]
+
+
+def _write_part(path: Path, rows: Mapping[str, segments.Rows]) -> None:
+    order = sorted(rows, key=lambda name: (-rows[name].dtype.itemsize, name))
+    rows = {name: rows[name] for name in order}
+    fingerprint = _write(path, _chunks(_header(rows, {}), rows))
+    _seen[_identity(path)] = fingerprint
+
+
+def _link(old: Path, new: Path) -> bool:
+    """Whether `new` is now another name of `old`: not every file system has this."""
+    try:
+        os.link(old, new)
+    except OSError:
+        # A network may report failure of what it did: writing would then go through to `old`.
+        new.unlink(missing_ok=True)
+        return False
+    return True
+
+
+def _intact_parts(directory: Path, names: Iterable[str]) -> dict[str, Path]:
+    """Where in the checkpoints in `directory` files of these names are, as they were written."""
+    wanted, there = set(names), {}
+    for folder in _checkpoints(directory) if wanted else []:
+        try:
+            files = json.loads((folder / COMMIT).read_bytes())["files"]
+            for name in wanted.intersection(files).difference(there):
+                if _part_fingerprint(folder / name, reread=False) == files[name]:
+                    there[name] = folder / name
+        except (OSError, ValueError, KeyError, TypeError):
+            continue  # damaged: what only it has is written again
+    return there
 
 
 def _write(path: Path, chunks: Iterable[bytes | memoryview]) -> dict[str, Any]:
@@ -461,6 +555,8 @@ def _difference(committed: bytes, found: dict[str, dict[str, Any]]) -> str:
     """Which file is not as COMMIT says."""
     try:
         files = json.loads(committed)["files"]
+        if missing := set(files).difference(found):
+            return f"{' and '.join(sorted(missing))} is missing"
         for name, now in found.items():
             then = files[name]
             if now["bytes"] != then["bytes"]:

@@ -23,18 +23,25 @@ import jax
 import numpy as np
 
 from ..environments.base import AbstractEnvironment
+from ..environments.host import AbstractHostEnvironment
 from ..evolution.crossover import AbstractCrossover
 from ..evolution.mutation import AbstractMutation
 from ..evolution.selection import AbstractSelection
+from ..learners.base import AbstractLearner
 from ..networks.base import AbstractNetwork
+from ..networks.exploration import AbstractNoise
 
 EXTENSIONS = (
     AbstractEnvironment,
+    AbstractHostEnvironment,
     AbstractNetwork,
     AbstractMutation,
     AbstractCrossover,
     AbstractSelection,
+    AbstractLearner,
+    AbstractNoise,
 )
+PACKAGES = ("credo", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
 
 
 class ConfigError(ValueError):
@@ -134,10 +141,7 @@ def differences(a: Any, b: Any, path: str = "") -> list[str]:
 
 def machine() -> dict[str, Any]:
     """What a result depends on beside the config."""
-    versions = {
-        name: importlib.metadata.version(name)
-        for name in ("credo", "jax", "jaxlib", "equinox", "numpy", "gymnasium")
-    }
+    versions = {name: version for name in PACKAGES if (version := _version(name)) is not None}
     return {
         "versions": {"python": platform.python_version(), **versions},
         "processor": _processor(),
@@ -152,6 +156,13 @@ def available_cores() -> list[int]:
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def _processor() -> str:

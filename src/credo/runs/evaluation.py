@@ -8,15 +8,21 @@ import numpy as np
 
 from .. import tree
 from ..analysis import counting, floors
+from ..environments.host import AbstractHostEnvironment
 from ..environments.sequence_classification import SequenceClassification
 from ..rollout import evaluate
 from .loop import Run
 
+EPISODES, HOST_EPISODES = 1000, 20  # a task outside JAX is slower by orders of magnitude
 STREAMED = 1000  # deeper sequences are streamed: memory does not grow with their length
 
 
-def describe(run: Run, task: Any, episodes: int, seed: int) -> Iterator[str]:
-    """Lines about the champion on `task`, which may differ from the one it was trained on."""
+def describe(run: Run, task: Any, episodes: int | None, seed: int) -> Iterator[str]:
+    """Lines about the champion on `task`, which may differ from the one it was trained on.
+    `episodes`: None for `EPISODES`, or `HOST_EPISODES` of a task outside JAX."""
+    if episodes is None:
+        host = issubclass(type(task), AbstractHostEnvironment)
+        episodes = HOST_EPISODES if host else EPISODES
     policies = tree.stack(run.champion)
     key = jax.random.fold_in(jax.random.key(seed), 1_000_003)  # not a key of any training run
     streamed = isinstance(task, SequenceClassification) and task.persistence == 0.5

@@ -14,8 +14,12 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from . import checkpoint, config
+from . import checkpoint, config, log
+from .budget import Budget
 from .loop import Interrupted, Run, RunError, Signals
+from .progress import clock
+
+TOLD = 60.0  # seconds between two lines on the runs under way, where there is no terminal
 
 
 @dataclasses.dataclass
@@ -24,8 +28,10 @@ class Job:
 
     path: pathlib.Path
     algorithm: Any
-    generations: int
+    generations: int | None
     seed: int
+    frames: int | None = None  # with neither limit: the algorithm's default budget
+    warm_start: str | None = None  # the run whose champion this one starts from
     stop_at: float | None = None
     wall_clock: float | None = None  # seconds
     checkpoint_every: float = 60.0  # seconds
@@ -39,32 +45,52 @@ class Job:
         )
         return json.loads(json.dumps(tree))
 
+    @property
+    def budget(self) -> Budget:
+        algorithm = self.algorithm
+        if isinstance(algorithm, dict):
+            algorithm = config.find_class(algorithm["class"])
+        return Budget.of(algorithm, self.generations, self.frames, self.stop_at)
+
     def finished(self) -> bool:
         """Whether the champion on disk is the budget's. Raises if the folder holds another run."""
         if not (self.path / "config.json").exists():
             return False
-        recorded = Run(self.path).config
-        lines = config.differences(recorded["algorithm"], self.tree)
-        if recorded["budget"]["generations"] > self.generations:
-            lines.append(f"generations: {recorded['budget']['generations']} != {self.generations}")
-        if recorded["seed"] != self.seed or lines:
+        run = Run(self.path)
+        lines = config.differences(run.config["algorithm"], self.tree)
+        recorded, budget = Budget.read(run.config["budget"]), self.budget
+        for name in ("generations", "frames"):
+            old, new = getattr(recorded, name), getattr(budget, name)
+            if old is not None and (new is None or old > new):
+                lines.append(f"{name}: {old} != {new}")
+        if run.config.get("warm_start") != self.warm_start:
+            lines.append(f"warm start: {run.config.get('warm_start')} != {self.warm_start}")
+        if run.config["seed"] != self.seed or lines:
             raise RunError(
                 f"{self.path} holds a run with other settings ({'; '.join(lines) or 'seed'}): "
                 "remove it or choose another folder"
             )
         champion = self.path / "champion.safetensors"
-        if not champion.exists():
+        row = log.last(self.path / "metrics.csv")
+        if not champion.exists() or not row:
             return False
-        done = int(checkpoint.read_metadata(champion)["generation"])
-        if self.stop_at is not None:
-            scores = Run(self.path).metrics.get("champion_score", [])
-            if len(scores) and scores[-1] >= self.stop_at - 1e-6:
-                return True
-        return done >= self.generations
+        if checkpoint.read_metadata(champion)["generation"] != row["generation"]:
+            return False  # killed since: what the rows say is not what the champion is
+        score = float(row["champion_score"])
+        return budget.reached(int(row["generation"]), int(row["frames"]), score) is not None
 
     def message(self) -> str:
-        fields = dataclasses.asdict(self) | {"path": str(self.path), "algorithm": self.tree}
-        return json.dumps(fields)
+        budget = self.budget.record()
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return json.dumps(fields | budget | {"path": str(self.path), "algorithm": self.tree})
+
+    def state(self) -> str:
+        """How far it is, in a few words."""
+        row = log.last(self.path / "metrics.csv")
+        done = "starting"
+        if row:
+            done = self.budget.done(int(row["generation"]), int(row["frames"]))
+        return f"{self.path.name} {done}"
 
 
 def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> None:
@@ -76,17 +102,7 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
     cores = config.available_cores()
     workers = min(workers or len(cores), len(waiting))
     failures: list[str] = []
-    console = Console(file=sys.stderr)
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=24))
-    bar = Progress(
-        *columns,
-        TextColumn("{task.completed}/{task.total} {task.fields[text]}"),
-        TimeElapsedColumn(),
-        console=console,
-        disable=not console.is_terminal,
-    )
-    task = bar.add_task(title, total=len(jobs), completed=len(jobs) - len(waiting), text="")
-    queue, began, done = iter(list(waiting)), time.monotonic(), 0
+    queue, done, under_way = iter(list(waiting)), 0, list[Job]()
     guard = threading.Lock()
 
     def work(core: int) -> None:
@@ -95,27 +111,22 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
         while not signals.received:
             with guard:
                 job = next(queue, None)
-            if job is None:
-                break
+                if job is None:
+                    break
+                under_way.append(job)
             answer = _ask(process, job)
             with guard:
+                under_way.remove(job)
                 if "error" in answer:
                     failures.append(f"{job.path}: {answer['error']}")
                 done += 1
-                left = (time.monotonic() - began) / done * (len(waiting) - done)
-                bar.update(task, advance=1, text=f"left {left / 60:.1f} min")
-                if not console.is_terminal:
-                    print(
-                        f"{title}: {done}/{len(waiting)} {job.path}, left {left / 60:.1f} min",
-                        file=sys.stderr,
-                        flush=True,
-                    )
+                board.finished(job, done)
             if process.poll() is not None:
                 _end(process)
                 process = _start(core)
         _end(process)
 
-    with Signals() as signals, bar:
+    with Signals() as signals, Board(title, len(jobs), len(waiting)) as board:
         threads = [
             threading.Thread(target=work, args=(cores[i % len(cores)],), daemon=True)
             for i in range(workers)
@@ -129,6 +140,8 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
                 for process in list(_processes):
                     if process.poll() is None:
                         process.send_signal(signals.received)
+            with guard:
+                board.show(under_way)
             time.sleep(0.05)
     if done < len(waiting) and not (signals.received or failures):
         failures.append(f"{len(waiting) - done} runs were never started: a worker could not start")
@@ -138,6 +151,53 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
         )
     if failures:
         raise RunError(f"{len(failures)} of {len(waiting)} runs failed:\n" + "\n".join(failures))
+
+
+class Board:
+    """How many runs are done, and how far those under way are. A bar on a terminal, else lines."""
+
+    def __init__(self, title: str, total: int, waiting: int):
+        self.title, self.waiting = title, waiting
+        self.console = Console(file=sys.stderr)
+        self.bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.completed}/{task.total} {task.fields[text]}"),
+            TimeElapsedColumn(),
+            console=self.console,
+            disable=not self.console.is_terminal,
+        )
+        self.task = self.bar.add_task(title, total=total, completed=total - waiting, text="")
+        self.began = self.shown = time.monotonic()
+        self.left = ""
+
+    def __enter__(self):
+        self.bar.start()
+        return self
+
+    def __exit__(self, *_):
+        self.bar.stop()
+
+    def finished(self, job: Job, done: int) -> None:
+        """`job` is the run number `done` of those that were waiting."""
+        left = (time.monotonic() - self.began) / done * (self.waiting - done)
+        self.left = f"left {clock(left)}"
+        self.bar.update(self.task, advance=1, text=self.left)
+        self._print(f"{done}/{self.waiting} {job.path}, {self.left}")
+
+    def show(self, under_way: list[Job]) -> None:
+        """Look how far they are, now and then."""
+        terminal = self.console.is_terminal
+        if time.monotonic() - self.shown < (1.0 if terminal else TOLD) or not under_way:
+            return
+        self.shown = time.monotonic()
+        states = ", ".join(job.state() for job in under_way)
+        self.bar.update(self.task, text=f"{self.left} {states}".strip())
+        self._print(states)
+
+    def _print(self, text: str) -> None:
+        if not self.console.is_terminal:
+            print(f"{self.title}: {text}", file=sys.stderr, flush=True)
 
 
 _processes: list[subprocess.Popen] = []

@@ -27,7 +27,10 @@ class Log:
             )
 
     def append(self, rows: Sequence[dict[str, float | int]], seconds: float, elapsed: float):
-        """`rows`: one per generation, in order; `seconds` they took together; `elapsed` so far."""
+        """`rows`: one per generation, in order; `seconds` they took together; `elapsed` so far.
+
+        Raises `ValueError` if their names are not those of the rows before.
+        """
         _append(self.directory / "metrics.csv", rows)
         last = {"generation": rows[-1]["generation"], "seconds": elapsed}
         last["generations_per_second"] = len(rows) / max(seconds, 1e-9)
@@ -35,7 +38,8 @@ class Log:
         if self.events is not None:
             for row in rows:
                 for name, value in row.items():
-                    if name != "generation":
+                    # tensorboardX would print a line about every NaN.
+                    if name != "generation" and np.isfinite(value):
                         self.events.add_scalar(name, value, int(row["generation"]))
 
     def sync(self):
@@ -65,18 +69,44 @@ def read(path: pathlib.Path) -> dict[str, np.ndarray]:
     }
 
 
+def last(path: pathlib.Path) -> dict[str, str]:
+    """The newest whole row of a metrics file, by column, however long the file; or nothing."""
+    header = _header(path)
+    if header is None:
+        return {}
+    with path.open("rb") as file:
+        file.seek(0, os.SEEK_END)
+        file.seek(max(0, file.tell() - 2**16))
+        whole = file.read().decode().split("\n")[1:-1]  # the first may lack its beginning
+    return dict(zip(header, whole[-1].split(","), strict=True)) if whole else {}
+
+
+def _header(path: pathlib.Path) -> list[str] | None:
+    if not path.exists():
+        return None
+    with path.open() as file:
+        line = file.readline()
+    return line[:-1].split(",") if line.endswith("\n") else None
+
+
 def _text(value: float | int) -> str:
     # Nine digits are enough for a float32 to come back as itself.
     return str(int(value)) if isinstance(value, int | np.integer) else f"{float(value):.9g}"
 
 
 def _append(path: pathlib.Path, rows: Sequence[dict[str, float | int]]):
-    new = not path.exists()
+    names = list(rows[0])
+    header = _header(path) or names
+    if header != names:
+        raise ValueError(
+            f"a generation has the metrics {', '.join(names)}, but {path} has "
+            f"{', '.join(header)}: they must be the same in every generation"
+        )
     try:
         with path.open("a", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
-            if new:
-                writer.writerow(rows[0])
+            if file.tell() == 0:
+                writer.writerow(names)
             writer.writerows([_text(value) for value in row.values()] for row in rows)
     except OSError as error:
         help = f"{error.strerror}: free some space, then resume; checkpoints are intact"

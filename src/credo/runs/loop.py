@@ -10,14 +10,17 @@ A run is a folder:
     champion.safetensors the best policy, with its config inside
 """
 
+import contextlib
+import dataclasses
 import json
 import pathlib
+import re
 import shutil
 import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -28,12 +31,17 @@ from jaxtyping import PRNGKeyArray, PyTree
 
 from .. import compilation, require
 from ..compilation import jit
+from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from . import checkpoint, config, log
+from .budget import Budget
 from .lock import lock
 from .progress import Progress
 
 CHUNK = 64  # generations in one dispatch, at most
 DISPATCH = 0.3  # seconds that one dispatch should last
+MOST = 2**31 - 1  # what 32 bits hold
+
+Callback = Callable[[int, dict[str, Any]], bool | None]
 
 
 class RunError(RuntimeError):
@@ -108,33 +116,40 @@ class Policy:
 def train(
     algorithm: Any,
     *,
-    generations: int,
+    generations: int | None = None,
+    frames: int | None = None,
     seed: int = 0,
     path: str | pathlib.Path | None = None,
+    warm_start: str | pathlib.Path | None = None,
     stop_at: float | None = None,
     wall_clock: float | None = None,
     checkpoint_every: float = 60.0,
     keep: int = 3,
     tensorboard: bool = True,
     progress: bool = True,
-    callback: Callable[[int, dict[str, Any]], bool | None] | None = None,
+    callback: Callback | None = None,
 ) -> Run:
     """Start a run in an empty or new folder and train.
 
     **Arguments:**
 
-    - `generations`: the budget. - `seed`: everything random follows from it.
+    - `generations`, `frames` (environment steps): the budget. The run ends after the first
+      generation that reaches one of them; without both, the algorithm's `default_budget`, or
+      else 1000 generations.
+    - `seed`: everything random follows from it.
     - `path`: the run's folder; by default `runs/<algorithm>-<task>-<seed>`.
+    - `warm_start`: another run, whose champion this one starts from.
     - `stop_at`: end early once a generation's `champion_score` reaches this.
     - `wall_clock`: seconds after which to save and end.
     - `checkpoint_every`: seconds between checkpoints; `keep`: how many stay on disk.
     - `callback(generation, metrics)`: called for every generation, after the dispatch it ran in;
       return True to end. What the dispatch has run by then is kept.
 
-    **Raises:** `RunError` if the folder holds a run already, `Interrupted` after a signal.
+    **Raises:** `RunError` if the folder holds a run already, if the algorithm cannot start from
+    a policy, or if an environment outside JAX fails; `Interrupted` after a signal.
     """
     compilation.enable_cache()
-    require.at_least("generations", generations, 1)
+    budget = Budget.of(algorithm, generations, frames, stop_at)
     require.at_least("keep", keep, 1)
     record_of = config.to_tree(algorithm)
     config.from_tree(record_of)  # what cannot be read back should fail now, not at a resume
@@ -144,61 +159,29 @@ def train(
             f"{path} holds a run already: `credo resume {path}` goes on with it; choose another "
             "path for a new one"
         )
-    path.mkdir(parents=True, exist_ok=True)
     record = {
         "algorithm": record_of,
         "seed": seed,
-        "budget": {"generations": generations, "stop_at": stop_at},
+        "budget": budget.record(),
         "machine": config.machine(),
     }
-    options = {"checkpoint_every": checkpoint_every, "keep": keep, "tensorboard": tensorboard}
-    with lock(path):
-        if (path / "config.json").exists():
-            raise RunError(f"another process started a run in {path} just now: choose another path")
+    if warm_start is not None:
+        record["warm_start"] = str(warm_start)
+    with _new_folder(path):
         # Left by a process that was killed before it wrote its config: nobody can resume it.
         shutil.rmtree(path / "checkpoints", ignore_errors=True)
         state = _initial(algorithm, jax.random.key(seed))
+        if warm_start is not None:
+            state = _warm(algorithm, state, Run(warm_start))
         # The first checkpoint comes before the config: what has a config can be resumed.
         checkpoint.save(path / "checkpoints", 0, eqx.filter(state, eqx.is_array), {"frames": 0})
+        del state  # it may fill half of the memory, and is read back
         config.write_json(path / "config.json", record)
-        return _train(
-            Run(path), algorithm, wall_clock, progress=progress, callback=callback, **options
-        )
-
-
-def resume(
-    path: str | pathlib.Path,
-    *,
-    generations: int | None = None,
-    stop_at: float | None = None,
-    wall_clock: float | None = None,
-    checkpoint_every: float = 60.0,
-    keep: int = 3,
-    tensorboard: bool = True,
-    progress: bool = True,
-    callback: Callable[[int, dict[str, Any]], bool | None] | None = None,
-) -> Run:
-    """Go on with a run from its newest intact checkpoint, to its own budget or a larger one.
-
-    The result has the same bits as that of a run never stopped (same machine and core count).
-    A new `generations` budget without a `stop_at` drops the one the run had.
-    """
-    run = Run(path)
-    with lock(run.path):
-        budget = run.config["budget"]
-        if generations is not None and generations < budget["generations"]:
-            raise RunError(
-                f"this run's budget is {budget['generations']} generations: a new budget must be "
-                f"larger, not {generations}"
-            )
-        if generations is not None or stop_at is not None:
-            budget["generations"] = generations or budget["generations"]
-            budget["stop_at"] = stop_at
-            config.write_json(run.path / "config.json", run.config)
-        _warn_of_other_machine(run.config["machine"])
+        run = Run(path)
         return _train(
             run,
-            run.algorithm,
+            algorithm,
+            _load(run, algorithm),
             wall_clock,
             checkpoint_every=checkpoint_every,
             keep=keep,
@@ -208,75 +191,175 @@ def resume(
         )
 
 
-def _train(run, algorithm, wall_clock, *, checkpoint_every, keep, tensorboard, progress, callback):
-    """From the newest checkpoint to the end of the budget. The caller holds the lock."""
+def resume(
+    path: str | pathlib.Path,
+    *,
+    generations: int | None = None,
+    frames: int | None = None,
+    stop_at: float | None = None,
+    wall_clock: float | None = None,
+    checkpoint_every: float = 60.0,
+    keep: int = 3,
+    tensorboard: bool = True,
+    progress: bool = True,
+    callback: Callback | None = None,
+) -> Run:
+    """Go on with a run from its newest intact checkpoint, to its own budget or a larger one.
+
+    The result has the same bits as that of a run never stopped (same machine and core count).
+    A new budget takes the place of the whole old one: with `generations` alone a limit of frames
+    is dropped, and the other way round; without `stop_at` that is dropped too.
+    """
     compilation.enable_cache()
-    root = jax.random.key(run.config["seed"])
-    like = eqx.filter_eval_shape(algorithm.init, key=root)
+    run = Run(path)
+    with lock(run.path):
+        algorithm = run.algorithm
+        saved = _load(run, algorithm)
+        old = Budget.read(run.config["budget"])
+        if generations is not None or frames is not None:
+            budget = Budget.of(algorithm, generations, frames, stop_at)
+            try:
+                budget.refuse_smaller(old, saved.generation, int(saved.counters["frames"]))
+            except ValueError as error:
+                raise RunError(str(error)) from None
+        else:
+            budget = old if stop_at is None else dataclasses.replace(old, stop_at=stop_at)
+        if budget != old:
+            run.config["budget"] = budget.record()
+            config.write_json(run.path / "config.json", run.config)
+        _warn_of_other_machine(run.config["machine"])
+        return _train(
+            run,
+            algorithm,
+            saved,
+            wall_clock,
+            checkpoint_every=checkpoint_every,
+            keep=keep,
+            tensorboard=tensorboard,
+            progress=progress,
+            callback=callback,
+        )
+
+
+def _load(run: Run, algorithm: Any) -> checkpoint.Checkpoint:
+    """The newest intact checkpoint, its state whole."""
+    like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0))
     like, static = eqx.partition(like, lambda x: isinstance(x, jax.ShapeDtypeStruct))
     saved = checkpoint.load(run.path / "checkpoints", like)
-    state = eqx.combine(saved.state, static)
-    generation, frames = saved.generation, int(saved.counters["frames"])
-    budget = run.config["budget"]["generations"]
-    stop_at = run.config["budget"]["stop_at"]
-    # The mean of 49 of 50 in float32 is a little less than 0.98. NaN: no comparison ever stops.
-    stop_score = np.float32(np.nan if stop_at is None else stop_at - 1e-6)
+    return eqx.tree_at(lambda saved: saved.state, saved, eqx.combine(saved.state, static))
+
+
+def _train(
+    run: Run,
+    algorithm: Any,
+    saved: checkpoint.Checkpoint,
+    wall_clock: float | None,
+    *,
+    checkpoint_every: float,
+    keep: int,
+    tensorboard: bool,
+    progress: bool,
+    callback: Callback | None,
+) -> Run:
+    """From `saved` to the end of the budget. The caller holds the lock."""
+    root = jax.random.key(run.config["seed"])
+    state, generation, frames = saved.state, saved.generation, int(saved.counters["frames"])
+    del saved  # the state is donated: nobody may hold the old one
+    budget = Budget.read(run.config["budget"])
     rows = log.read(run.path / "metrics.csv")
-    score = _score_at(rows, generation)
-    journal = log.Log(run.path, generation, tensorboard=tensorboard)
+    reached = budget.reached(generation, frames, _score_at(rows, generation))
+    journal = log.Log(run.path, generation, tensorboard=tensorboard and not reached)
     before = log.read(run.path / "timing.csv").get("seconds", np.zeros(1))[-1]
     began = last_save = time.monotonic()
-    chunk, ended = 1, False
+    safe, chunk, ended = generation, 1, False
 
-    with Signals() as signals, Progress(run.path, generation, budget, progress) as bar:
-        while generation < budget and not (score >= stop_score or ended or signals.received):
+    with Signals() as signals, Progress(run.path, generation, frames, budget, progress) as bar:
+        if reached:
+            bar.say(f"is finished: {reached}; to go on give a larger --generations or --frames")
+        else:
+            bar.start()
+        while not (reached or ended or signals.received):
             tick = time.monotonic()
-            n = min(chunk, budget - generation)
-            state, score, count, metrics = advance(
-                algorithm, state, root, np.int32(generation), np.int32(n), stop_score
-            )
-            columns = jax.tree.map(np.asarray, metrics)
-            batch = []
-            for i in range(int(count)):
-                row = {name: column[i].item() for name, column in columns.items()}
-                generation += 1
-                frames += int(row.pop("frames"))
-                batch.append({"generation": generation, "frames": frames, **row})
+            try:
+                state, batch = play(algorithm, state, root, generation, frames, chunk, budget)
+            except EnvironmentFailure as failure:
+                # The state was donated: what is on disk is all there is.
+                journal.close()
+                raise RunError(
+                    f"{str(failure).rstrip('.')}. The checkpoint of generation {safe} stands; "
+                    f"resume with `credo resume {run.path}`"
+                ) from failure
+            generation, frames = batch[-1]["generation"], batch[-1]["frames"]
             now = time.monotonic()
             seconds = now - tick
             journal.append(batch, seconds, before + now - began)
-            bar.update(generation, batch[-1], seconds, len(batch))
+            bar.update(generation, batch[-1], seconds)
             if callback is not None:
                 answers = [callback(row["generation"], row) for row in batch]
                 ended = any(answers)
             ended = ended or (wall_clock is not None and now - began >= wall_clock)
+            reached = budget.reached(generation, frames, batch[-1]["champion_score"])
             if now - last_save >= checkpoint_every:
                 journal.sync()
                 _save(run, algorithm, generation, state, frames, keep)
-                last_save = now
+                safe, last_save = generation, now
             # The first dispatch compiles; from the second on, its length follows the clock.
             # How many generations one dispatch holds is data and changes no result.
-            chunk = 2 if chunk == 1 else int(np.clip(n * DISPATCH / seconds, 1, CHUNK))
+            chunk = 2 if chunk == 1 else int(np.clip(len(batch) * DISPATCH / seconds, 1, CHUNK))
         journal.close()
         journal.sync()
         _save(run, algorithm, generation, state, frames, keep)
-    if signals.received and generation < budget:
+    if signals.received and not reached:
         raise Interrupted(
-            f"stopped at generation {generation} of {budget} and saved; go on with "
+            f"stopped at {budget.where(generation, frames)} and saved; go on with "
             f"`credo resume {run.path}`",
             128 + signals.received,
         )
     return run
 
 
-@jit
-def advance(
-    algorithm: Any, state: PyTree, root: PRNGKeyArray, generation: Any, n: Any, stop_at: Any
-):
-    """`n` generations, at most `CHUNK`, in one program; fewer if a score reaches `stop_at`.
+def play(
+    algorithm: Any,
+    state: PyTree,
+    root: PRNGKeyArray,
+    generation: int,
+    frames: int,
+    n: int,
+    budget: Budget,
+) -> tuple[PyTree, list[dict[str, Any]]]:
+    """The next generations, at most `n` and `CHUNK`, none beyond the budget; one if the task lies
+    outside JAX. `state` is used up.
 
-    **Returns:** the state, the last score, how many ran, and metrics `[CHUNK]` each.
+    **Returns:** the state and a row of metrics, in Python numbers, for each generation.
     """
+    if isinstance(algorithm.env, AbstractHostEnvironment):
+        state, metrics = algorithm.generation(state, key=jax.random.fold_in(root, generation + 1))
+        columns, count = jax.tree.map(lambda x: np.asarray(x)[None], metrics), 1
+    else:
+        n = min(n, CHUNK, (budget.generations or MOST) - generation)
+        left = min((budget.frames or MOST) - frames, MOST)
+        numbers = (np.int32(generation), np.int32(n), np.int32(left), budget.stop_score)
+        state, count, metrics = advance((algorithm, root, *numbers), state)
+        columns = jax.tree.map(np.asarray, metrics)
+    batch = []
+    for i in range(int(count)):
+        row = {name: column[i].item() for name, column in columns.items()}
+        frames += int(row.pop("frames"))
+        batch.append({"generation": generation + i + 1, "frames": frames, **row})
+    return state, batch
+
+
+@jit(donate="all-except-first")
+def advance(fixed: tuple[Any, ...], state: PyTree):
+    """`n` generations, at most `CHUNK`, in one program; fewer if a score reaches `stop_at`, or
+    their frames `left`. The memory of `state` is used for the result.
+
+    **Arguments:** `fixed`: the algorithm, the root key, how many generations are done, `n`,
+    `left` and `stop_at`.
+
+    **Returns:** the state, how many generations ran, and metrics `[CHUNK]` each.
+    """
+    algorithm, root, generation, n, left, stop_at = fixed
     dynamic, static = eqx.partition(state, eqx.is_array)
 
     def one(dynamic, i):
@@ -289,18 +372,19 @@ def advance(
     empty = jax.tree.map(lambda x: jnp.zeros((CHUNK, *x.shape), x.dtype), shapes)
 
     def body(loop):
-        i, dynamic, _, kept = loop
+        i, left, dynamic, _, kept = loop
         dynamic, metrics = one(dynamic, i)
         kept = jax.tree.map(lambda xs, x: xs.at[i].set(x), kept, metrics)
-        return i + 1, dynamic, metrics["champion_score"], kept
+        left = left - metrics["frames"].astype(jnp.int32)
+        return i + 1, left, dynamic, metrics["champion_score"], kept
 
     def ongoing(loop):
-        i, _, score, _ = loop
-        return (i < n) & ~(score >= stop_at)
+        i, left, _, score, _ = loop
+        return (i < n) & (left > 0) & ~(score >= stop_at)
 
-    start = (jnp.int32(0), dynamic, jnp.float32(-jnp.inf), empty)
-    count, dynamic, score, kept = jax.lax.while_loop(ongoing, body, start)
-    return eqx.combine(dynamic, static), score, count, kept
+    start = (jnp.int32(0), left, dynamic, jnp.float32(-jnp.inf), empty)
+    count, _, dynamic, _, kept = jax.lax.while_loop(ongoing, body, start)
+    return eqx.combine(dynamic, static), count, kept
 
 
 @jit
@@ -315,6 +399,35 @@ def _save(run: Run, algorithm: Any, generation: int, state: PyTree, frames: int,
     checkpoint.export_policy(run.path / "champion.safetensors", state.champion, metadata)
 
 
+def _warm(algorithm: Any, state: PyTree, source: Run) -> PyTree:
+    """The first state, started from the champion of another run."""
+    if not hasattr(algorithm, "warm"):
+        raise RunError(
+            f"{type(algorithm).__name__} cannot start from another run's champion: only an "
+            "algorithm with a method `warm(state, policy)` can"
+        )
+    policy = checkpoint.import_policy(source.path / "champion.safetensors", state.champion)
+    return algorithm.warm(state, policy)
+
+
+@contextlib.contextmanager
+def _new_folder(path: pathlib.Path) -> Iterator[None]:
+    """Own a folder for a run. If none comes to be in it, the folder goes again."""
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    with lock(path):
+        if (path / "config.json").exists():
+            raise RunError(f"another process started a run in {path} just now: choose another path")
+        try:
+            yield
+        except BaseException:
+            if made and not (path / "config.json").exists():
+                shutil.rmtree(path, ignore_errors=True)
+                with contextlib.suppress(OSError):  # something else may lie there by now
+                    for folder in made[1:]:
+                        folder.rmdir()
+            raise
+
+
 def _score_at(rows: dict[str, np.ndarray], generation: int) -> float:
     if generation == 0 or "champion_score" not in rows:
         return -np.inf
@@ -322,8 +435,11 @@ def _score_at(rows: dict[str, np.ndarray], generation: int) -> float:
     return float(rows["champion_score"][match[-1]]) if match.size else -np.inf
 
 
-def free_name(algorithm: Any, seed: int | str) -> pathlib.Path:
-    name = f"{type(algorithm).__name__}-{type(algorithm.env).__name__}-{seed}".lower()
+def free_name(algorithm: Any, seed: int | str, label: str = "") -> pathlib.Path:
+    """A folder that does not exist. `label`: what stands before the seed; by default the names of
+    the algorithm and the task."""
+    label = label or f"{type(algorithm).__name__}-{type(algorithm.env).__name__}"
+    name = re.sub(r"[^\w.]+", "-", f"{label}-{seed}".lower())
     path, copies = pathlib.Path("runs") / name, 1
     while path.exists():
         copies += 1
@@ -333,8 +449,11 @@ def free_name(algorithm: Any, seed: int | str) -> pathlib.Path:
 
 def _warn_of_other_machine(recorded: dict[str, Any]):
     here = config.machine()
+    # What an older version did not record, a run of that time did not use.
+    known = recorded.get("versions", {})
+    here["versions"] = {name: here["versions"].get(name) for name in known}
     for what in ("cores", "processor", "device", "versions"):
-        lines = config.differences(recorded.get(what), here[what], what)
+        lines = config.differences(recorded.get(what, {}), here[what], what)
         if lines:
             warnings.warn(
                 f"this run began elsewhere ({'; '.join(lines)}): it goes on, but not bit for bit",

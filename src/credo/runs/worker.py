@@ -41,6 +41,7 @@ def main() -> None:
                 name: job[name]
                 for name in (
                     "generations",
+                    "frames",
                     "stop_at",
                     "wall_clock",
                     "checkpoint_every",
@@ -52,7 +53,8 @@ def main() -> None:
                 loop.resume(path, progress=False, **options)
             else:
                 algorithm = config.from_tree(job["algorithm"])
-                loop.train(algorithm, seed=job["seed"], path=path, progress=False, **options)
+                start = {"seed": job["seed"], "warm_start": job["warm_start"]}
+                loop.train(algorithm, path=path, progress=False, **start, **options)
             answer = {"ok": str(path)}
         except loop.Interrupted as stop:
             answers.write(json.dumps({"error": str(stop)}) + "\n")

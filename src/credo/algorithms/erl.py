@@ -1,0 +1,360 @@
+"""ERL and CERL: Khadka (2019), Algorithms 6 and 10 (Khadka & Tumer 2018; Khadka et al. 2019).
+
+A population evolves on whole returns, a portfolio of learners descends gradients, and all share
+one replay buffer. ERL is the portfolio of one without a resource manager, EA the empty portfolio.
+
+Departures from the printed boxes:
+
+- A generation makes as many updates as frames were played (line 21 of Algorithm 10); Algorithm 6
+  prints a single one. `updates_per_frame` scales it, and nothing is learned in the generation in
+  which the buffer reaches `warmup_frames`.
+- The box selects k-e members and then fills up to k-e: of a member that was drawn repeatedly,
+  the repetitions are crossed with an elite, as in the author's code.
+- The new population is ordered: elites, then offspring by the rank of their parents. A learner's
+  actor takes the last slots, never an elite's; the author's could overwrite one.
+- Line 23 weighs up the weakest of a population just bred, of which none has a fitness yet; it is
+  the offspring of the weakest parent here.
+- Mutation adds noise in proportion to a weight and hits matrices alone, as the author's code.
+- Time limits bootstrap, both gradients are clipped, and OU noise starts anew with each episode.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+
+from .. import require, tree
+from ..compilation import jit
+from ..environments.host import AbstractHostEnvironment
+from ..evolution.crossover import AbstractCrossover, MaskedCrossover
+from ..evolution.lineage import Lineage
+from ..evolution.mutation import AbstractMutation, MatrixMutation
+from ..evolution.selection import AbstractSelection, Tournament, rankable, ranking, repeated
+from ..learners.base import AbstractLearner, learn
+from ..learners.manager import UCB, AbstractManager, Ledger, even
+from ..learners.td3 import TD3, ddpg
+from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.mlp import MLP
+from ..replay import Replay, extend
+from ..rollout import Environment, blank, collect, evaluate
+from ..types import Metrics
+from .off_policy import when
+
+TABLE_5_1 = {  # task: (ψ, ξ, ω)
+    "HalfCheetah": (0.1, 1, 10),
+    "Swimmer": (0.1, 1, 10),
+    "Reacher": (0.2, 5, 10),
+    "Ant": (0.3, 1, 1),
+    "Hopper": (0.3, 5, 1),
+    "Walker2d": (0.2, 3, 10),
+}
+MUTATION = MatrixMutation(
+    gate="genome", super_probability=0.05, reset_probability=0.05, vectors=False
+)
+
+
+class ERLState(eqx.Module):
+    population: PyTree  # leaves [k, ...]; bred, not yet evaluated
+    lineage: Lineage
+    learners: tuple[PyTree, ...]
+    replay: Any  # a Replay, or None where nobody learns
+    ledger: Ledger
+    allocation: Int[Array, " b"]  # the learner of each rollout worker
+    champion: AbstractPolicy  # the fittest of the generation before
+    score: Float[Array, ""]  # of the champion that was tested last
+    frames: Int[Array, ""]
+    episodes: Int[Array, ""]
+    generation: Int[Array, ""]
+
+
+class ERL(eqx.Module):
+    """Evolve `network` policies on `env` beside a portfolio of learners."""
+
+    default_budget: ClassVar[dict[str, int]] = {"frames": 1_000_000}
+
+    env: Environment
+    network: AbstractNetwork = MLP(hidden=(128, 128), normalization="before", initializer="uniform")
+    learners: tuple[AbstractLearner, ...] = (ddpg(),)
+    population_size: int = eqx.field(static=True, default=10)  # k
+    elite_fraction: float = eqx.field(static=True, default=0.1)  # ψ
+    episodes: int = eqx.field(static=True, default=1)  # ξ: per fitness
+    selection: AbstractSelection = Tournament()
+    crossover: AbstractCrossover = MaskedCrossover()
+    crossover_probability: float = 0.0  # chance to cross an offspring drawn once
+    mutation: AbstractMutation = MUTATION
+    workers: int = eqx.field(static=True, default=1)  # b: episodes that learners play
+    manager: AbstractManager | None = None  # None: workers in turn
+    sync_period: int = eqx.field(static=True, default=10)  # ω, in generations
+    updates_per_frame: float = 1.0  # of each learner
+    warmup_frames: int = eqx.field(static=True, default=1_000)  # stored before anybody learns
+    replay_capacity: int = eqx.field(static=True, default=1_000_000)  # transitions
+    test_episodes: int = eqx.field(static=True, default=5)  # of the champion; not counted
+    test_every: int = eqx.field(static=True, default=1)  # generations between tests
+    fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
+
+    def __check_init__(self):
+        for name, least in (("population_size", 2), ("episodes", 1), ("workers", 1)):
+            require.at_least(name, getattr(self, name), least)
+        for name in ("sync_period", "replay_capacity", "test_episodes", "test_every"):
+            require.at_least(name, getattr(self, name), 1)
+        require.within("elite_fraction", self.elite_fraction, 0, 1)
+        require.within("crossover_probability", self.crossover_probability, 0, 1)
+        require.at_least("updates_per_frame", self.updates_per_frame, 0)
+        for signal in (self.fitness, *(learner.signal for learner in self.learners)):
+            require.signal(signal, self.env.signals)
+        if not 1 <= self.elites <= self.population_size - max(1, len(self.learners)):
+            raise ValueError(
+                f"elite_fraction is {self.elite_fraction} of {self.population_size} members: that "
+                f"must be at least 1, and leave {max(1, len(self.learners))} slots for offspring"
+            )
+
+    @classmethod
+    def erl(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """Section 5.4, with the task's column of Table 5.1."""
+        name = str(getattr(env, "id", "")).partition("-v")[0]
+        ψ, ξ, ω = TABLE_5_1.get(name, TABLE_5_1["HalfCheetah"])
+        settings: dict[str, Any] = {"elite_fraction": ψ, "episodes": ξ, "sync_period": ω}
+        if network is not None:
+            settings["network"] = network
+        return cls(env, **settings | overrides)
+
+    @classmethod
+    def ea(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """The same evolution without a learner."""
+        return cls.erl(env, network, **{"learners": ()} | overrides)
+
+    @classmethod
+    def cerl(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """Chapter 6: TD3 at four discounts, ten workers, UCB. What the text leaves open is the
+        author's: ω = 5, a fifth are elites."""
+        network = network or MLP(hidden=(256, 256), activation="relu", initializer="uniform")
+        settings = {
+            "learners": tuple(TD3(gamma=γ) for γ in (0.9, 0.99, 0.997, 0.9995)),
+            "workers": 10,
+            "manager": UCB(),
+            "elite_fraction": 0.2,
+            "sync_period": 5,
+            "test_episodes": 10,
+            "test_every": 5,
+        }
+        return cls(env, network, **settings | overrides)
+
+    @classmethod
+    def presets(cls) -> dict[str, Callable[..., Self]]:
+        """Settings by name, for the command line."""
+        return {"erl": cls.erl, "ea": cls.ea, "cerl": cls.cerl}
+
+    @property
+    def elites(self) -> int:
+        """e = int(ψ·k)"""
+        return int(self.elite_fraction * self.population_size)
+
+    def init(self, *, key: PRNGKeyArray) -> ERLState:
+        population_key, *learner_keys = jax.random.split(key, 1 + len(self.learners))
+        sizes = (self.env.obs_size, self.env.action_size)
+        k, q = self.population_size, len(self.learners)
+        # 1-4: Initialize learners, a population of k actors, and an empty cyclic replay buffer.
+        learners = tuple(
+            learner.init(self.network, *sizes, key=learner_key)
+            for learner, learner_key in zip(self.learners, learner_keys, strict=True)
+        )
+        population = eqx.filter_vmap(lambda key: self.network.init(*sizes, key=key))(
+            jax.random.split(population_key, k)
+        )
+        return ERLState(
+            population,
+            Lineage.first(k, q),
+            learners,
+            Replay.empty(blank(self.env), self.replay_capacity) if learners else None,
+            Ledger.empty(q),
+            even(self.workers, max(q, 1)),
+            tree.take(population, 0),
+            jnp.float32(jnp.nan),
+            *(jnp.int32(0) for _ in range(3)),
+        )
+
+    def warm(self, state: ERLState, policy: AbstractPolicy) -> ERLState:
+        """`state` that goes on from a saved policy: the first member, and every learner."""
+        learners = tuple(
+            learner.warm(s, policy)
+            for learner, s in zip(self.learners, state.learners, strict=True)
+        )
+        population = tree.put(state.population, 0, policy)
+        return eqx.tree_at(lambda s: (s.population, s.learners), state, (population, learners))
+
+    def generation(self, state: ERLState, *, key: PRNGKeyArray) -> tuple[ERLState, Metrics]:
+        """One pass of the outer loop of Algorithms 6 and 10."""
+        evaluate_key, breed_key, explore_key, learn_key, allocate_key, test_key = jax.random.split(
+            key, 6
+        )
+        # 6-7: for actor in pop: fitness, R = Evaluate(actor, R, noise=None, ξ)
+        played, experience = collect(self.env, state.population, self.episodes, key=evaluate_key)
+        fitness = jnp.mean(played.returns[self.signal], axis=1)
+        frames, episodes = jnp.sum(played.steps), jnp.int32(played.steps.size)
+        rows, valid = experience.transitions, experience.valid
+        replay: Any = extend(state.replay, rows, valid) if self.learners else None
+
+        # 8-15: rank, keep the elites, select, cross and mutate.
+        population, lineage, champion, bred = breed(
+            self, state.population, state.lineage, fitness, key=breed_key
+        )
+        # 16-20: learners play too, with noise; what they earn is their value.
+        ledger, metrics = state.ledger, {}
+        for i, (learner, learner_state) in enumerate(
+            zip(self.learners, state.learners, strict=True)
+        ):
+            workers = jnp.sum((state.allocation == i).astype(jnp.int32))
+            explorer = learner.explorer(learner_state, jnp.bool_(False))
+            played, experience = collect(
+                self.env,
+                tree.stack(explorer),
+                self.workers,
+                wanted=workers,
+                common=False,
+                key=jax.random.fold_in(explore_key, i),
+            )
+            replay = extend(replay, experience.transitions, experience.valid)
+            frames, episodes = frames + jnp.sum(played.steps), episodes + workers
+            ledger = observe(
+                self.manager or UCB(), ledger, i, played.returns[self.signal][0], workers
+            )
+            metrics |= {f"workers_{i}": workers, f"value_{i}": ledger.value[i]}
+
+        # 21-29: as many updates as frames, each learner on minibatches of its own.
+        ready = state.frames >= self.warmup_frames
+        updates = jnp.where(ready, frames.astype(jnp.float32) * self.updates_per_frame, 0.0)
+        updates = updates.astype(jnp.int32)
+        learners = []
+        for i, learner in enumerate(self.learners):
+            learned, report = learn(
+                learner,
+                state.learners[i],
+                replay,
+                updates,
+                signal=self.signal,
+                key=jax.random.fold_in(learn_key, i),
+            )
+            learners.append(learned)
+            metrics |= {f"{name}_{i}": value for name, value in report.items()}
+
+        # 30-33: allocate the workers of the next generation.
+        allocation = state.allocation
+        if self.manager is not None and learners:
+            allocation = self.manager.allocate(ledger, self.workers, key=allocate_key)
+
+        # 34-36: every ω generations, copy each learner's actor over the weakest.
+        generation = state.generation + 1
+        sync = (generation % self.sync_period == 0) & (updates > 0)
+        for i, learner in enumerate(self.learners):
+            slot = self.population_size - 1 - i
+            guests = tree.put(population, slot, learner.actor(learners[i]))
+            population = tree.where(sync, guests, population)
+            lineage = tree.where(sync, lineage.inject(slot, i), lineage)
+
+        score = when(
+            (generation - 1) % self.test_every == 0,
+            lambda: jnp.mean(self.test(champion, key=test_key)),
+            lambda: state.score,
+            host=isinstance(self.env, AbstractHostEnvironment),
+        )
+        metrics |= bred | {
+            "fitness_max": jnp.max(rankable(fitness)),
+            "fitness_mean": jnp.nanmean(fitness),
+            "fitness_nan": jnp.sum(jnp.isnan(fitness)),
+            "champion_score": score,
+            "episodes": state.episodes + episodes,
+            "updates": updates,
+            "frames": frames,
+        }
+        return ERLState(
+            population,
+            lineage,
+            tuple(learners),
+            replay,
+            ledger,
+            allocation,
+            champion,
+            score,
+            state.frames + frames,
+            state.episodes + episodes,
+            generation,
+        ), metrics
+
+    @property
+    def signal(self) -> str:
+        """The reward that fitness and, unless they name another, learners optimise."""
+        return self.fitness or self.env.signals[0]
+
+    def test(self, champion: AbstractPolicy, *, key: PRNGKeyArray) -> Float[Array, "1 episodes"]:
+        """Returns of the signal that is reported, on fresh episodes."""
+        played = evaluate(self.env, tree.stack(champion), self.test_episodes, key=key)
+        return played.returns[self.env.signals[-1]]
+
+
+@jit
+def breed(
+    erl: ERL,
+    population: PyTree,
+    lineage: Lineage,
+    fitness: Float[Array, " k"],
+    *,
+    key: PRNGKeyArray,
+) -> tuple[PyTree, Lineage, AbstractPolicy, Metrics]:
+    """The next population with its lineage, elites first; the champion; where it came from and
+    what became of the learners' actors."""
+    select_key, mate_key, chance_key, cross_key, mutate_key = jax.random.split(key, 5)
+    n = erl.population_size - erl.elites
+
+    # 8-9: Rank the population; select the first e as elites.
+    order = ranking(fitness)
+    elites = order[: erl.elites]
+    # 10: Select (k - e) actors, to form set S; the offspring of better parents come first.
+    parents = erl.selection(fitness, n, key=select_key)
+    parents = parents[jnp.argsort(jnp.argsort(order)[parents], stable=True)]
+    # 11-12: Crossover between a random elite and a member of S.
+    mates = elites[jax.random.randint(mate_key, (n,), 0, erl.elites)]
+    crossed = jax.random.bernoulli(chance_key, erl.crossover_probability, (n,))
+    crossed = crossed | repeated(parents)
+    survivors = tree.take(population, parents)
+    children = eqx.filter_vmap(lambda a, b, key: erl.crossover(a, b, key=key))(
+        tree.take(population, mates), survivors, jax.random.split(cross_key, n)
+    )
+    offspring = eqx.filter_vmap(tree.where)(crossed, children, survivors)
+    # 13-15: Mutate set S.
+    mutants = eqx.filter_vmap(lambda genome, key: erl.mutation(genome, key=key))(
+        offspring, jax.random.split(mutate_key, n)
+    )
+    mutated = eqx.filter_vmap(differ)(mutants, offspring)
+
+    champion = order[0]
+    metrics = {"champion_maker": lineage.maker[champion]}
+    fates = lineage.fates(elites, parents)
+    for i in range(len(erl.learners)):
+        metrics[f"champion_share_{i}"] = lineage.share[champion, 1 + i]
+        metrics |= {f"{fate}_{i}": count[i] for fate, count in fates.items()}
+    return (
+        tree.concat(tree.take(population, elites), mutants),
+        lineage.children(elites, parents, mates, crossed, mutated),
+        tree.take(population, champion),
+        metrics,
+    )
+
+
+@jit
+def observe(
+    manager: AbstractManager,
+    ledger: Ledger,
+    i: int,
+    returns: Float[Array, " b"],
+    played: Int[Array, ""],
+) -> Ledger:
+    """The ledger with the first `played` returns of learner `i`."""
+    return manager.observe(ledger, i, returns, jnp.arange(returns.shape[0]) < played)
+
+
+def differ(a: PyTree, b: PyTree) -> Array:
+    """Whether two genomes differ anywhere."""
+    return jnp.any(tree.ravel(a)[0] != tree.ravel(b)[0])

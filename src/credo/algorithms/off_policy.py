@@ -1,0 +1,152 @@
+"""One learner alone: act, remember, learn. The baselines of ERL and CERL.
+
+TD3 is Algorithm 1 of Fujimoto et al. (2018), DDPG that of Lillicrap et al. (2016), SAC that of
+Haarnoja et al. (2018). Departure from all three: a generation plays whole episodes and then
+makes as many updates as frames were played, so that its end is a state to resume from.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+
+from .. import require, tree
+from ..environments.host import AbstractHostEnvironment
+from ..learners.base import AbstractLearner, learn
+from ..learners.sac import SAC
+from ..learners.td3 import TD3, ddpg
+from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.mlp import MLP
+from ..replay import Replay, extend
+from ..rollout import Environment, blank, collect, evaluate
+from ..types import Metrics
+
+
+class OffPolicyState(eqx.Module):
+    learner: PyTree
+    replay: Replay
+    champion: AbstractPolicy  # the actor as it was last tested
+    score: Float[Array, ""]  # of that test
+    frames: Int[Array, ""]
+
+
+class OffPolicy(eqx.Module):
+    """Train `learner` on `env` from its own experience."""
+
+    default_budget: ClassVar[dict[str, int]] = {"frames": 1_000_000}
+
+    env: Environment
+    network: AbstractNetwork = MLP(hidden=(256, 256), activation="relu", initializer="uniform")
+    learner: AbstractLearner = TD3()
+    episodes: int = eqx.field(static=True, default=1)  # played between updates
+    start_frames: int = eqx.field(static=True, default=25_000)  # of random actions at first
+    updates_per_frame: float = 1.0
+    test_episodes: int = eqx.field(static=True, default=10)  # without noise; not counted
+    test_every: int = eqx.field(static=True, default=5_000)  # frames between tests
+    replay_capacity: int = eqx.field(static=True, default=1_000_000)  # transitions
+
+    def __check_init__(self):
+        for name in ("episodes", "test_episodes", "test_every", "replay_capacity"):
+            require.at_least(name, getattr(self, name), 1)
+        require.at_least("start_frames", self.start_frames, 0)
+        require.at_least("updates_per_frame", self.updates_per_frame, 0)
+        require.signal(self.learner.signal, self.env.signals)
+
+    @classmethod
+    def td3(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """The constants of TD3's authors, second version."""
+        return cls(env, **_given(network=network) | overrides)
+
+    @classmethod
+    def ddpg(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """The constants of ERL's learner (Khadka 2019, section 5.4)."""
+        network = network or MLP(
+            hidden=(128, 128), normalization="before", initializer="uniform", output_scale=0.1
+        )
+        settings = {"learner": ddpg(), "start_frames": 1_000}
+        return cls(env, network, **settings | overrides)
+
+    @classmethod
+    def sac(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """The constants of SAC's authors, with a learned temperature."""
+        settings = {"learner": SAC(), "start_frames": 10_000}
+        return cls(env, **_given(network=network) | settings | overrides)
+
+    @classmethod
+    def presets(cls) -> dict[str, Callable[..., Self]]:
+        """Settings by name, for the command line."""
+        return {"td3": cls.td3, "ddpg": cls.ddpg, "sac": cls.sac}
+
+    def init(self, *, key: PRNGKeyArray) -> OffPolicyState:
+        env = self.env
+        learner = self.learner.init(self.network, env.obs_size, env.action_size, key=key)
+        replay = Replay.empty(blank(env), self.replay_capacity)
+        actor = self.learner.actor(learner)
+        return OffPolicyState(learner, replay, actor, jnp.float32(jnp.nan), jnp.int32(0))
+
+    def warm(self, state: OffPolicyState, policy: AbstractPolicy) -> OffPolicyState:
+        """`state` that goes on from a saved policy of the same network."""
+        learner = self.learner.warm(state.learner, policy)
+        return OffPolicyState(learner, state.replay, policy, state.score, state.frames)
+
+    def generation(
+        self, state: OffPolicyState, *, key: PRNGKeyArray
+    ) -> tuple[OffPolicyState, Metrics]:
+        explore_key, learn_key, test_key = jax.random.split(key, 3)
+
+        # Act with noise (at first at random), and remember every transition.
+        explorer = self.learner.explorer(state.learner, state.frames < self.start_frames)
+        played, experience = collect(
+            self.env, tree.stack(explorer), self.episodes, common=False, key=explore_key
+        )
+        replay = extend(state.replay, experience.transitions, experience.valid)
+        new = jnp.sum(played.steps)
+        frames = state.frames + new
+
+        # Learn from minibatches, once random actions are over.
+        total = jnp.floor(frames.astype(jnp.float32) * self.updates_per_frame)
+        before = jnp.floor(state.frames.astype(jnp.float32) * self.updates_per_frame)
+        updates = jnp.where(frames > self.start_frames, total - before, 0.0).astype(jnp.int32)
+        signal = self.env.signals[0]
+        learner, metrics = learn(
+            self.learner, state.learner, replay, updates, signal=signal, key=learn_key
+        )
+
+        # Test the actor without noise, now and then.
+        actor = self.learner.actor(learner)
+        due = (frames // self.test_every > state.frames // self.test_every) | (state.frames == 0)
+        score = when(
+            due,
+            lambda: jnp.mean(self.test(actor, key=test_key)),
+            lambda: state.score,
+            host=isinstance(self.env, AbstractHostEnvironment),
+        )
+        returns = played.returns[self.learner.signal or signal]
+        metrics |= {
+            "fitness_max": jnp.max(returns),
+            "fitness_mean": jnp.mean(returns),
+            "champion_score": score,
+            "frames": new,
+            "updates": updates,
+        }
+        champion = tree.where(due, actor, state.champion)
+        return OffPolicyState(learner, replay, champion, score, frames), metrics
+
+    def test(self, actor: AbstractPolicy, *, key: PRNGKeyArray) -> Float[Array, "1 episodes"]:
+        """Returns of the signal that is reported, without noise."""
+        played = evaluate(self.env, tree.stack(actor), self.test_episodes, key=key)
+        return played.returns[self.env.signals[-1]]
+
+
+def when(due: Any, play: Callable, skip: Callable, *, host: bool) -> Any:
+    """`play()` if `due`, else `skip()`; a host environment cannot be part of a program."""
+    if host:
+        return play() if due else skip()
+    return jax.lax.cond(due, play, skip)
+
+
+def _given(**fields) -> dict[str, Any]:
+    return {name: value for name, value in fields.items() if value is not None}

@@ -1,0 +1,73 @@
+"""Lineage: where each member of a population comes from, and what became of injected ones."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+DRAWN, MUTATED, CROSSED, CROSSED_AND_MUTATED, INJECTED = range(5)
+MAKERS = ("drawn", "mutation", "crossover", "crossover and mutation", "learner")
+
+
+class Lineage(eqx.Module):
+    """Of each member of a population, beside `q` learners."""
+
+    maker: Int[Array, " pop"]  # index into `MAKERS`: the last that changed it
+    share: Float[Array, "pop 1+q"]
+    """Expected share of its weights that go back to the first draw and to each learner's actor,
+    mutated since or not."""
+    guest: Int[Array, " pop"]  # learner whose actor was put here and not evaluated yet, else -1
+
+    @classmethod
+    def first(cls, pop: int, q: int) -> "Lineage":
+        share = jnp.zeros((pop, 1 + q)).at[:, 0].set(1.0)
+        return cls(jnp.full(pop, DRAWN), share, jnp.full(pop, -1))
+
+    def children(
+        self,
+        elites: Int[Array, " e"],
+        parents: Int[Array, " n"],
+        mates: Int[Array, " n"],
+        crossed: Bool[Array, " n"],
+        mutated: Bool[Array, " n"],
+    ) -> "Lineage":
+        """Of the next population: elites as they are, then a child of each parent. A crossed
+        child has half of its rows from its mate."""
+        both = 0.5 * (self.share[parents] + self.share[mates])
+        share = jnp.where(crossed[:, None], both, self.share[parents])
+        made = jnp.where(
+            mutated,
+            jnp.where(crossed, CROSSED_AND_MUTATED, MUTATED),
+            jnp.where(crossed, CROSSED, self.maker[parents]),
+        )
+        return Lineage(
+            jnp.concatenate([self.maker[elites], made]),
+            jnp.concatenate([self.share[elites], share]),
+            jnp.full(self.guest.shape, -1),
+        )
+
+    def inject(self, slot: int, learner: int) -> "Lineage":
+        """With a learner's actor in a slot."""
+        own = jnp.zeros(self.share.shape[1]).at[1 + learner].set(1.0)
+        return Lineage(
+            self.maker.at[slot].set(INJECTED),
+            self.share.at[slot].set(own),
+            self.guest.at[slot].set(learner),
+        )
+
+    def fates(self, elites: Int[Array, " e"], parents: Int[Array, " n"]) -> dict[str, Array]:
+        """How many of each learner's guests `[q]` became elite, were selected, or were neither
+        (Table 5.2)."""
+        members = jnp.arange(self.guest.shape[0])
+        elite = jnp.any(members[:, None] == elites[None], axis=1)
+        selected = jnp.any(members[:, None] == parents[None], axis=1) & ~elite
+        learners = jnp.arange(self.share.shape[1] - 1)
+        mine = self.guest[:, None] == learners[None]
+
+        def count(which):
+            return jnp.sum((mine & which[:, None]).astype(jnp.int32), axis=0)
+
+        return {
+            "elite": count(elite),
+            "selected": count(selected),
+            "discarded": count(~elite & ~selected),
+        }

@@ -1,0 +1,1 @@
+"""What needs a gradient and knows no population."""

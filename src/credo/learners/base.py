@@ -1,0 +1,147 @@
+"""The contract every gradient learner keeps, an `init`/`update` pair as in Optax, and what they
+share."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+
+from ..compilation import jit
+from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..replay import Replay
+from ..types import Batch, Metrics
+
+
+class AbstractLearner(eqx.Module):
+    """Learns a policy, the *actor*, from minibatches of anybody's experience.
+
+    Hyper-parameters that fix no shape are data: learners that differ in γ are one program.
+    """
+
+    signal: eqx.AbstractVar[str | None]  # the reward it optimises; None: the task's first
+    batch_size: eqx.AbstractVar[int]  # transitions per update
+    metrics: eqx.AbstractClassVar[tuple[str, ...]]  # names of what `update` reports
+
+    @abc.abstractmethod
+    def init(
+        self, network: AbstractNetwork, obs_size: int, action_size: int, *, key: PRNGKeyArray
+    ) -> PyTree:
+        """Fresh networks and optimiser states. The actor is one of `network`'s policies, so that
+        it can join a population of them."""
+
+    @abc.abstractmethod
+    def update(self, state: PyTree, batch: Batch, *, key: PRNGKeyArray) -> tuple[PyTree, Metrics]:
+        """One gradient step on one minibatch."""
+
+    @abc.abstractmethod
+    def actor(self, state: PyTree) -> AbstractPolicy:
+        """What has been learned, without noise."""
+
+    @abc.abstractmethod
+    def explorer(self, state: PyTree, random: Bool[Array, ""]) -> AbstractPolicy:
+        """The actor with this learner's noise, or with random actions."""
+
+    @abc.abstractmethod
+    def warm(self, state: PyTree, actor: AbstractPolicy) -> PyTree:
+        """`state` that goes on from a given actor."""
+
+
+def learn(
+    learner: AbstractLearner,
+    state: PyTree,
+    replay: Replay,
+    updates: Int[Array, ""],
+    *,
+    signal: str,
+    key: PRNGKeyArray,
+) -> tuple[PyTree, Metrics]:
+    """`updates` gradient steps, each on a minibatch of its own, in one program. Their number is
+    data. `signal`: what a learner optimises that names no reward itself.
+
+    **Returns:** the new state and the mean of each metric; NaN if there was no update.
+    """
+    if not isinstance(updates, jax.core.Tracer) and updates == 0:
+        # Nothing need be compiled for it: the first fitness of a run comes sooner.
+        return state, {name: jnp.float32(jnp.nan) for name in learner.metrics}
+    return _learn(learner, state, replay, updates, learner.signal or signal, key=key)
+
+
+@jit
+def _learn(
+    learner: AbstractLearner,
+    state: PyTree,
+    replay: Replay,
+    updates: Int[Array, ""],
+    signal: str,
+    *,
+    key: PRNGKeyArray,
+) -> tuple[PyTree, Metrics]:
+    dynamic, static = eqx.partition(state, eqx.is_array)
+
+    def one(dynamic, i):
+        sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
+        rows = replay.sample(learner.batch_size, key=sample_key)
+        reward = rows.rewards[signal]
+        batch = Batch(rows.obs, rows.action, reward, rows.next_obs, rows.terminated)
+        state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)
+        return eqx.filter(state, eqx.is_array), metrics
+
+    def body(i, loop):
+        dynamic, total = loop
+        dynamic, metrics = one(dynamic, i)
+        return dynamic, jax.tree.map(jnp.add, total, metrics)
+
+    zeros = {name: jnp.float32(0.0) for name in learner.metrics}
+    dynamic, total = jax.lax.fori_loop(0, updates, body, (dynamic, zeros))
+    count = updates.astype(jnp.float32)
+    return eqx.combine(dynamic, static), jax.tree.map(lambda x: x / count, total)
+
+
+def adam(
+    weights: PyTree,
+    gradient: PyTree,
+    state: optax.OptState,
+    rate: Float[Array, ""] | float,
+    max_norm: float | None = None,
+) -> tuple[PyTree, optax.OptState]:
+    """One step of Adam (Kingma & Ba 2015) down the gradient, clipped to a global norm."""
+    # Optax multiplies counters by floats, which strict promotion of dtypes would refuse.
+    with jax.numpy_dtype_promotion("standard"):
+        if max_norm is not None:
+            gradient, _ = optax.clip_by_global_norm(max_norm).update(gradient, optax.EmptyState())
+        step, state = optax.adam(rate).update(gradient, state)
+    return eqx.apply_updates(weights, step), state
+
+
+def adam_state(weights: PyTree) -> optax.OptState:
+    return optax.adam(0.0).init(eqx.filter(weights, eqx.is_inexact_array))
+
+
+def polyak(target: PyTree, source: PyTree, tau: Float[Array, ""] | float) -> PyTree:
+    """θ' ← τθ + (1-τ)θ'."""
+    return jax.tree.map(
+        lambda old, new: tau * new + (1.0 - tau) * old if eqx.is_inexact_array(old) else old,
+        target,
+        source,
+    )
+
+
+def act(policy: AbstractPolicy, obs: Float[Array, "batch obs"]) -> Float[Array, "batch act"]:
+    """Actions of a memoryless policy, for a batch."""
+    if policy.features_first:  # one matrix product per layer
+        return policy(obs.T, policy.start(key=None))[0].T  # pyright: ignore[reportArgumentType]
+    start = policy.start(key=jax.random.key(0))
+    return jax.vmap(lambda x: policy(x, start)[0])(obs)
+
+
+def require_memoryless(network: AbstractNetwork, policy: AbstractPolicy) -> None:
+    """Minibatches of single frames cannot train a network with memory."""
+    if jax.tree.leaves(jax.eval_shape(lambda: policy.start(key=jax.random.key(0)))):
+        raise TypeError(
+            f"{type(network).__name__} has memory, and this learner learns from single frames: "
+            "give a feed-forward network such as MLP, or evolve without a learner"
+        )

@@ -1,0 +1,112 @@
+"""Resource managers: which learner of a portfolio gets how many rollout workers.
+
+Source: Khadka (2019), section 6.2, equation 6.1 and Algorithm 10.
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from .. import require
+
+
+class Ledger(eqx.Module):
+    """What is known about each of `q` learners."""
+
+    value: Float[Array, " q"]  # running mean v of its returns
+    square: Float[Array, " q"]  # running mean of their squares
+    count: Int[Array, " q"]  # returns so far, y; their sum is H
+
+    @classmethod
+    def empty(cls, q: int) -> "Ledger":
+        return cls(jnp.zeros(q), jnp.zeros(q), jnp.zeros(q, jnp.int32))
+
+
+class AbstractManager(eqx.Module):
+    """Allocates workers by the returns learners had. The published rule and its rivals."""
+
+    memory: eqx.AbstractVar[float]  # α: weight of the newest return, in (0, 1]
+
+    def observe(
+        self, ledger: Ledger, i: int, returns: Float[Array, " n"], played: Bool[Array, " n"]
+    ) -> Ledger:
+        """With learner `i`'s new returns, one after the other: v ← α·return + (1-α)·v. The first
+        return of all is v; as printed v would start at 0 and be wrong for long."""
+
+        def one(ledger, new):
+            value, counts = new
+            α = jnp.where(ledger.count[i] == 0, 1.0, self.memory)
+            mean = α * value + (1.0 - α) * ledger.value[i]
+            square = α * value**2 + (1.0 - α) * ledger.square[i]
+            after = Ledger(
+                ledger.value.at[i].set(mean),
+                ledger.square.at[i].set(square),
+                ledger.count.at[i].add(1),
+            )
+            return jax.tree.map(lambda a, b: jnp.where(counts, a, b), after, ledger), None
+
+        return jax.lax.scan(one, ledger, (returns, played))[0]
+
+    @abc.abstractmethod
+    def allocate(self, ledger: Ledger, workers: int, *, key: PRNGKeyArray) -> Int[Array, " b"]:
+        """The learner of each worker."""
+
+
+class UCB(AbstractManager):
+    """Upper confidence bounds (equation 6.1), normalised to chances that workers are drawn from."""
+
+    exploration: float = 0.9  # c
+    memory: float = 0.2  # α; the text gives none, this is the author's
+
+    def __check_init__(self):
+        require.at_least("exploration", self.exploration, 0)
+        require.within("memory", self.memory, 0, 1)
+
+    def allocate(self, ledger, workers, *, key):
+        bounds = self.bounds(ledger)
+        chance = bounds / jnp.sum(bounds)
+        return jax.random.choice(key, ledger.value.shape[0], (workers,), p=chance)
+
+    def bounds(self, ledger: Ledger) -> Float[Array, " q"]:
+        """U_i = v̂_i + c √(ln H / y_i), v̂ the values normalised to [0, 1). A learner that was never
+        tried counts as tried once."""
+        above = ledger.value - jnp.min(ledger.value)
+        # The author's 0.1 keeps equal values from a division by 0.
+        value = above / (jnp.sum(above) + 0.1)
+        total = jnp.maximum(jnp.sum(ledger.count), 1).astype(jnp.float32)
+        tried = jnp.maximum(ledger.count, 1).astype(jnp.float32)
+        # A floor, so that c = 0 and equal values still are a distribution.
+        return value + self.exploration * jnp.sqrt(jnp.log(total) / tried) + 1e-6
+
+
+class Uniform(AbstractManager):
+    """The same chance for every learner: what a manager is measured against."""
+
+    memory: float = 0.2  # α, for the record alone
+
+    def allocate(self, ledger, workers, *, key):
+        return jax.random.randint(key, (workers,), 0, ledger.value.shape[0])
+
+
+class Thompson(AbstractManager):
+    """Each worker goes to the learner with the highest return imagined: a draw from the normal
+    distribution of its mean (Thompson 1933)."""
+
+    memory: float = 0.2  # α
+
+    def allocate(self, ledger, workers, *, key):
+        variance = jnp.maximum(ledger.square - ledger.value**2, 0.0)
+        # A running mean with weight α rests on (2 - α)/α returns, at most.
+        most = (2.0 - self.memory) / self.memory
+        rests_on = jnp.clip(ledger.count.astype(jnp.float32), 1.0, most)
+        spread = jnp.sqrt(variance / rests_on) + 1e-3 * (1.0 + jnp.abs(ledger.value))
+        drawn = jax.random.normal(key, (workers, ledger.value.shape[0]))
+        return jnp.argmax(ledger.value[None] + spread[None] * drawn, axis=1)
+
+
+def even(workers: int, q: int) -> Int[Array, " b"]:
+    """Workers in turn, as at the start: learner i mod q."""
+    return jnp.arange(workers) % q

@@ -1,0 +1,178 @@
+"""SAC: Haarnoja et al. (2018), "Soft Actor-Critic Algorithms and Applications", Algorithm 1, with
+the temperature learned.
+
+Departure: the actor that joins a population is the mean of the policy, squashed; the head for
+the standard deviation stays in the learner's state.
+"""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from .. import require
+from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.mlp import MLP, Critic, CriticNetwork, MLPPolicy, draw_layers, linear
+from ..types import Batch, Metrics
+from .base import AbstractLearner, adam, adam_state, polyak
+
+LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # of the authors' code
+
+
+class StochasticActor(eqx.Module):
+    """A squashed Gaussian: its mean is the actor, its spread a head on the actor's features."""
+
+    mean: MLPPolicy
+    head: dict[str, Float[Array, "..."]]  # W_0, b_0: features to log standard deviation
+
+    def sample(
+        self, obs: Float[Array, "obs *batch"], *, key: PRNGKeyArray
+    ) -> tuple[Float[Array, "act *batch"], Float[Array, "*batch"]]:
+        """Actions and their log probability density."""
+        features = self.mean.features(obs)
+        mean = self.mean.output(features)
+        log_std = jnp.clip(linear(self.head, 0, features), LOG_STD_MIN, LOG_STD_MAX)
+        noise = jax.random.normal(key, mean.shape)
+        u = mean + jnp.exp(log_std) * noise
+        # log N(u) - log |d tanh / du|, the latter as 2 (log 2 - u - softplus(-2u)).
+        log_p = -0.5 * jnp.square(noise) - log_std - 0.5 * jnp.log(2.0 * jnp.pi)
+        log_p = log_p - 2.0 * (jnp.log(2.0) - u - jax.nn.softplus(-2.0 * u))
+        return jnp.tanh(u), jnp.sum(log_p, axis=0)
+
+
+class Sampler(AbstractPolicy):
+    """Explores by drawing from the policy itself."""
+
+    actor: StochasticActor
+    random: Bool[Array, ""]  # draw actions uniformly from [-1, 1]
+    features_first: ClassVar[bool] = False
+
+    def start(self, *, key: PRNGKeyArray) -> PRNGKeyArray:
+        return key
+
+    def __call__(self, obs, carry):
+        carry, sample_key, random_key = jax.random.split(carry, 3)
+        action, _ = self.actor.sample(obs, key=sample_key)
+        drawn = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
+        return jnp.where(self.random, drawn, action), carry
+
+
+class SACState(eqx.Module):
+    actor: StochasticActor
+    critics: tuple[CriticNetwork, ...]
+    target_critics: tuple[CriticNetwork, ...]
+    log_alpha: Float[Array, ""]
+    actor_opt: optax.OptState
+    critic_opt: optax.OptState
+    alpha_opt: optax.OptState
+
+
+class SAC(AbstractLearner):
+    """Soft actor-critic: maximises reward and the policy's entropy."""
+
+    metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "actor_loss", "alpha")
+
+    critic: Critic = Critic()
+    gamma: float = 0.99  # discount per step, in [0, 1]
+    actor_lr: float = 3e-4  # of Adam
+    critic_lr: float = 3e-4
+    alpha_lr: float = 3e-4
+    tau: float = 5e-3  # share of the new weights in the targets
+    target_entropy: float = -1.0  # nats per action dimension
+    critics: int = eqx.field(static=True, default=2)  # the least of them is believed
+    batch_size: int = eqx.field(static=True, default=256)
+    signal: str | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        require.within("gamma", self.gamma, 0, 1)
+        require.within("tau", self.tau, 0, 1)
+        for name in ("actor_lr", "critic_lr", "alpha_lr"):
+            require.at_least(name, getattr(self, name), 0)
+        for name in ("critics", "batch_size"):
+            require.at_least(name, getattr(self, name), 1)
+
+    def init(
+        self, network: AbstractNetwork, obs_size: int, action_size: int, *, key: PRNGKeyArray
+    ) -> SACState:
+        if not (isinstance(network, MLP) and network.output_activation == "tanh"):
+            raise TypeError(f"SAC needs an MLP with a tanh output as its network, not {network}")
+        actor_key, head_key, critic_key = jax.random.split(key, 3)
+        mean = network.init(obs_size, action_size, key=actor_key)
+        units = network.hidden[-1] if network.hidden else obs_size
+        head = draw_layers((units, action_size), network.initializer, key=head_key)
+        actor = StochasticActor(mean, head)
+        critics = tuple(
+            self.critic.init(obs_size, action_size, key=key)
+            for key in jax.random.split(critic_key, self.critics)
+        )
+        log_alpha = jnp.float32(0.0)
+        opts = (adam_state(actor), adam_state(critics), adam_state(log_alpha))
+        return SACState(actor, critics, critics, log_alpha, *opts)
+
+    def update(
+        self, state: SACState, batch: Batch, *, key: PRNGKeyArray
+    ) -> tuple[SACState, Metrics]:
+        target_key, actor_key = jax.random.split(key)
+        alpha = jnp.exp(state.log_alpha)
+
+        target = self.soft_target(state, batch, alpha, key=target_key)
+        critic_loss, gradient = eqx.filter_value_and_grad(soft_critic_error)(
+            state.critics, batch, target
+        )
+        critics, critic_opt = adam(state.critics, gradient, state.critic_opt, self.critic_lr)
+
+        (actor_loss, log_p), gradient = eqx.filter_value_and_grad(soft_actor_loss, has_aux=True)(
+            state.actor, critics, batch, alpha, key=actor_key
+        )
+        actor, actor_opt = adam(state.actor, gradient, state.actor_opt, self.actor_lr)
+
+        # The temperature rises while the entropy -log_p is below its target.
+        entropy = self.target_entropy * batch.action.shape[1]
+        gradient = -jnp.mean(log_p + entropy)
+        log_alpha, alpha_opt = adam(state.log_alpha, gradient, state.alpha_opt, self.alpha_lr)
+        targets = polyak(state.target_critics, critics, self.tau)
+        state = SACState(actor, critics, targets, log_alpha, actor_opt, critic_opt, alpha_opt)
+        return state, {"critic_loss": critic_loss, "actor_loss": actor_loss, "alpha": alpha}
+
+    def soft_target(
+        self, state: SACState, batch: Batch, alpha: Float[Array, ""], *, key: PRNGKeyArray
+    ) -> Float[Array, " batch"]:
+        """y = r + γ (min_i Q'_i(s', a') - α log π(a'|s')), a' drawn from the policy."""
+        obs = batch.next_obs.T
+        action, log_p = state.actor.sample(obs, key=key)
+        q = jnp.min(jnp.stack([critic(obs, action) for critic in state.target_critics]), axis=0)
+        return batch.reward + self.gamma * jnp.where(batch.terminated, 0.0, q - alpha * log_p)
+
+    def actor(self, state: SACState) -> AbstractPolicy:
+        return state.actor.mean
+
+    def explorer(self, state: SACState, random: Bool[Array, ""]) -> AbstractPolicy:
+        return Sampler(state.actor, random)
+
+    def warm(self, state: SACState, actor: AbstractPolicy) -> SACState:
+        return eqx.tree_at(lambda s: s.actor.mean, state, actor)
+
+
+def soft_critic_error(
+    critics: tuple[CriticNetwork, ...], batch: Batch, target: Float[Array, " batch"]
+) -> Float[Array, ""]:
+    """Half the sum over critics of the mean squared Bellman error."""
+    qs = jnp.stack([critic(batch.obs.T, batch.action.T) for critic in critics])
+    return 0.5 * jnp.sum(jnp.mean(jnp.square(qs - target[None]), axis=1))
+
+
+def soft_actor_loss(
+    actor: StochasticActor,
+    critics: tuple[CriticNetwork, ...],
+    batch: Batch,
+    alpha: Float[Array, ""],
+    *,
+    key: PRNGKeyArray,
+) -> tuple[Float[Array, ""], Float[Array, " batch"]]:
+    """E[α log π(a|s) - min_i Q_i(s, a)] and log π, a drawn from the policy."""
+    action, log_p = actor.sample(batch.obs.T, key=key)
+    q = jnp.min(jnp.stack([critic(batch.obs.T, action) for critic in critics]), axis=0)
+    return jnp.mean(alpha * log_p - q), log_p

@@ -1,0 +1,167 @@
+"""TD3: Fujimoto, van Hoof & Meger (2018), Algorithm 1; and DDPG, which is TD3 with one critic and
+without its three additions: Lillicrap et al. (2016), Algorithm 1.
+
+Departures: an update follows whole episodes, as many as frames were collected, as in the
+authors' first code. Time limits bootstrap; the author of ERL took them for the end of the task.
+The author clipped the gradient of DDPG's critic twice and of its actor never; both are clipped.
+"""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from .. import require
+from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.exploration import AbstractNoise, Explorer, GaussianNoise, OrnsteinUhlenbeck
+from ..networks.mlp import Critic, CriticNetwork
+from ..types import Batch, Metrics
+from .base import AbstractLearner, act, adam, adam_state, polyak, require_memoryless
+
+
+class TD3State(eqx.Module):
+    actor: AbstractPolicy
+    critics: tuple[CriticNetwork, ...]
+    target_actor: AbstractPolicy
+    target_critics: tuple[CriticNetwork, ...]
+    actor_opt: optax.OptState
+    critic_opt: optax.OptState
+    step: Int[Array, ""]
+
+
+class TD3(AbstractLearner):
+    """Deterministic actor-critic: twin critics, delayed policy, target policy smoothing."""
+
+    metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "q")
+
+    critic: Critic = Critic()
+    gamma: float = 0.99  # discount per step, in [0, 1]
+    actor_lr: float = 3e-4  # of Adam
+    critic_lr: float = 3e-4
+    tau: float = 5e-3  # share of the new weights in the targets
+    target_noise: float = 0.2  # std of the smoothing noise, in units of actions
+    target_noise_clip: float = 0.5
+    noise: AbstractNoise = GaussianNoise()  # exploration
+    critics: int = eqx.field(static=True, default=2)  # the least of them is believed
+    policy_delay: int = eqx.field(static=True, default=2)  # critic steps per step of the actor
+    max_norm: float | None = None  # both gradients are clipped to this norm
+    batch_size: int = eqx.field(static=True, default=256)
+    signal: str | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        require.within("gamma", self.gamma, 0, 1)
+        require.within("tau", self.tau, 0, 1)
+        for name in ("actor_lr", "critic_lr", "target_noise", "target_noise_clip"):
+            require.at_least(name, getattr(self, name), 0)
+        for name in ("critics", "policy_delay", "batch_size"):
+            require.at_least(name, getattr(self, name), 1)
+
+    def init(
+        self, network: AbstractNetwork, obs_size: int, action_size: int, *, key: PRNGKeyArray
+    ) -> TD3State:
+        actor_key, critic_key = jax.random.split(key)
+        actor = network.init(obs_size, action_size, key=actor_key)
+        require_memoryless(network, actor)
+        critics = tuple(
+            self.critic.init(obs_size, action_size, key=key)
+            for key in jax.random.split(critic_key, self.critics)
+        )
+        return TD3State(
+            actor,
+            critics,
+            actor,
+            critics,
+            adam_state(actor),
+            adam_state(critics),
+            jnp.int32(0),
+        )
+
+    def update(
+        self, state: TD3State, batch: Batch, *, key: PRNGKeyArray
+    ) -> tuple[TD3State, Metrics]:
+        target = self.bellman_target(state, batch, key=key)
+        (critic_loss, q), gradient = eqx.filter_value_and_grad(critic_error, has_aux=True)(
+            state.critics, batch, target
+        )
+        critics, critic_opt = adam(
+            state.critics, gradient, state.critic_opt, self.critic_lr, self.max_norm
+        )
+        moving = (state.actor, state.actor_opt, state.target_actor, state.target_critics)
+
+        def move_policy():
+            actor, actor_opt, target_actor, target_critics = moving
+            gradient = eqx.filter_grad(actor_loss)(actor, critics[0], batch)
+            actor, actor_opt = adam(actor, gradient, actor_opt, self.actor_lr, self.max_norm)
+            target_actor = polyak(target_actor, actor, self.tau)
+            return actor, actor_opt, target_actor, polyak(target_critics, critics, self.tau)
+
+        if self.policy_delay > 1:
+            due = state.step % self.policy_delay == 0
+            moving = jax.lax.cond(due, move_policy, lambda: moving)
+        else:
+            moving = move_policy()
+        actor, actor_opt, target_actor, target_critics = moving
+        state = TD3State(
+            actor, critics, target_actor, target_critics, actor_opt, critic_opt, state.step + 1
+        )
+        return state, {"critic_loss": critic_loss, "q": q}
+
+    def bellman_target(
+        self, state: TD3State, batch: Batch, *, key: PRNGKeyArray
+    ) -> Float[Array, " batch"]:
+        """y = r + γ min_i Q'_i(s', π'(s') + clipped noise)."""
+        noise = self.target_noise * jax.random.normal(key, batch.action.shape)
+        noise = jnp.clip(noise, -self.target_noise_clip, self.target_noise_clip)
+        action = jnp.clip(act(state.target_actor, batch.next_obs) + noise, -1.0, 1.0)
+        qs = [critic(batch.next_obs.T, action.T) for critic in state.target_critics]
+        q = jnp.min(jnp.stack(qs), axis=0)
+        return batch.reward + self.gamma * jnp.where(batch.terminated, 0.0, q)
+
+    def actor(self, state: TD3State) -> AbstractPolicy:
+        return state.actor
+
+    def explorer(self, state: TD3State, random: Bool[Array, ""]) -> AbstractPolicy:
+        action_size = state.critics[0].action_size
+        return Explorer(state.actor, self.noise, random, action_size)
+
+    def warm(self, state: TD3State, actor: AbstractPolicy) -> TD3State:
+        return eqx.tree_at(lambda s: (s.actor, s.target_actor), state, (actor, actor))
+
+
+def ddpg(**fields) -> TD3:
+    """DDPG as settings of `TD3`, with the constants of ERL (Khadka 2019, section 5.4)."""
+    settings = {
+        "critics": 1,
+        "policy_delay": 1,
+        "target_noise": 0.0,
+        "noise": OrnsteinUhlenbeck(),
+        "critic": Critic(
+            hidden=(300,),
+            branches=(200, 200),
+            activation="elu",
+            normalization="before",
+            output_scale=0.1,
+        ),
+        "actor_lr": 5e-5,
+        "critic_lr": 5e-4,
+        "tau": 1e-3,
+        "max_norm": 10.0,
+        "batch_size": 128,
+    }
+    return TD3(**(settings | fields))
+
+
+def critic_error(
+    critics: tuple[CriticNetwork, ...], batch: Batch, target: Float[Array, " batch"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Sum over critics of the mean squared Bellman error, and their mean value."""
+    qs = jnp.stack([critic(batch.obs.T, batch.action.T) for critic in critics])
+    return jnp.sum(jnp.mean(jnp.square(qs - target[None]), axis=1)), jnp.mean(qs)
+
+
+def actor_loss(actor: AbstractPolicy, critic: CriticNetwork, batch: Batch) -> Float[Array, ""]:
+    """Minus the value of what the actor would do (deterministic policy gradient)."""
+    return -jnp.mean(critic(batch.obs.T, act(actor, batch.obs).T))

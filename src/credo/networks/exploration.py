@@ -1,0 +1,75 @@
+"""Exploration: a policy around another one, whose carry holds the noise and its key."""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+
+from .. import require
+from .base import AbstractPolicy
+
+
+class AbstractNoise(eqx.Module):
+    """Noise of one episode, in units of actions, which lie in [-1, 1]."""
+
+    @abc.abstractmethod
+    def __call__(
+        self, before: Float[Array, " act"], *, key: PRNGKeyArray
+    ) -> tuple[Float[Array, " act"], Float[Array, " act"]]:
+        """What is added to this action, and what the next call gets as `before` (at first 0)."""
+
+
+class GaussianNoise(AbstractNoise):
+    """Independent N(0, std), as TD3 explores."""
+
+    std: float = 0.1
+
+    def __check_init__(self):
+        require.at_least("std", self.std, 0)
+
+    def __call__(self, before, *, key):
+        return self.std * jax.random.normal(key, before.shape), before
+
+
+class OrnsteinUhlenbeck(AbstractNoise):
+    """Correlated noise, as DDPG explores (Uhlenbeck & Ornstein 1930, in discrete time), from 0 at
+    the start of each episode. The author's code never reset it, and scaled it by 0.3."""
+
+    theta: float = 0.15  # share of the way back to 0 per step
+    sigma: float = 0.2  # std of what each step adds
+    scale: float = 0.3  # of the whole
+
+    def __check_init__(self):
+        require.within("theta", self.theta, 0, 1)
+        require.at_least("sigma", self.sigma, 0)
+        require.at_least("scale", self.scale, 0)
+
+    def __call__(self, before, *, key):
+        x = before - self.theta * before + self.sigma * jax.random.normal(key, before.shape)
+        return self.scale * x, x
+
+
+class Explorer(AbstractPolicy):
+    """A policy with noise on its actions, or actions drawn uniformly while it knows nothing."""
+
+    policy: AbstractPolicy
+    noise: AbstractNoise
+    random: Bool[Array, ""]  # draw actions uniformly from [-1, 1]
+    action_size: int = eqx.field(static=True)
+    features_first: ClassVar[bool] = False
+
+    def start(self, *, key: PRNGKeyArray) -> PyTree:
+        policy_key, noise_key = jax.random.split(key)
+        return self.policy.start(key=policy_key), jnp.zeros(self.action_size), noise_key
+
+    def __call__(self, obs, carry):
+        carry, before, key = carry
+        key, noise_key, random_key = jax.random.split(key, 3)
+        action, carry = self.policy(obs, carry)
+        noise, before = self.noise(before, key=noise_key)
+        drawn = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
+        action = jnp.where(self.random, drawn, jnp.clip(action + noise, -1.0, 1.0))
+        return action, (carry, before, key)

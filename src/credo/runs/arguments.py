@@ -1,0 +1,139 @@
+"""What the command line makes of its words: flags for the fields of objects, and complaints.
+
+Nothing here imports JAX.
+"""
+
+import dataclasses
+import difflib
+import re
+import sys
+import warnings
+from collections.abc import Iterable
+from typing import Annotated, Any, NoReturn
+
+
+def fail(
+    message: str, given: str = "", known: Iterable[str] = (), more: Iterable[str] = ()
+) -> NoReturn:
+    """One line on what is wrong, one on what to do, exit code 2. `more`: names that may have been
+    meant, but are too many to be listed."""
+    print(f"credo: {message}", file=sys.stderr)
+    known = list(known)
+    close = difflib.get_close_matches(given, [*known, *more], n=1, cutoff=0.5)
+    if close:
+        print(f"       did you mean {close[0]!r}?", file=sys.stderr)
+    elif known:
+        print(f"       choose one of: {', '.join(known)}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def plain_integer(token: str) -> str:
+    """`1e6` is a valid integer."""
+    if re.fullmatch(r"\d+(\.\d+)?e\+?\d+", token) and float(token).is_integer():
+        return str(int(float(token)))
+    return token
+
+
+def pop_option(argv: list[str], name: str, default: str, short: str = "") -> tuple[str, list[str]]:
+    """Take `--name value` or `--name=value` out of the arguments."""
+    rest, value, tokens = [], default, iter(argv)
+    for token in tokens:
+        if token == name or (short and token == short):
+            value = next(tokens, "")
+            if not value:
+                fail(f"{name} needs a value")
+        elif token.startswith(f"{name}="):
+            value = token.partition("=")[2]
+        else:
+            rest.append(token)
+    return value, rest
+
+
+def pop_switch(argv: list[str], name: str) -> tuple[bool, list[str]]:
+    """Take `--name` out of the arguments."""
+    return name in argv, [token for token in argv if token != name]
+
+
+def seconds(text: str | None) -> float | None:
+    """`90s`, `30m` or `2h`."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text)
+    if match is None:
+        fail(f"wall-clock is {text!r}: write seconds, minutes or hours as 90s, 30m or 2h")
+    return float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]]
+
+
+def parse(
+    prog: str,
+    default: Any,
+    options: type,
+    argv: list[str],
+    *,
+    flat: bool = False,
+    popped: tuple[str, ...] = (),
+) -> list[Any]:
+    """Flags for the fields of `default` (if any) and of `options`.
+
+    A task's own fields need no prefix (`--depth`), those of other parts do (`--network.hidden`,
+    `--learners.0.gamma`). `flat`: `default` is itself a task. `popped`: flags that the caller took
+    out of `argv` before; a misspelled one is still there.
+    """
+    import tyro
+
+    arguments = []
+    if default is not None:
+        default = _with_plain_task(default)
+        plain = Annotated[type(default), tyro.conf.arg(name="")]
+        arguments.append(("object", plain, dataclasses.field(default=default)))
+    plain = Annotated[options, tyro.conf.arg(name="")]
+    arguments.append(("options", plain, dataclasses.field(default_factory=options)))
+    command = dataclasses.make_dataclass("Command", arguments)
+    command.__doc__ = options.__doc__
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Mutable type")
+        try:
+            parsed = tyro.cli(command, prog=prog, args=argv, config=(tyro.conf.FlagConversionOff,))
+        except ValueError as error:
+            fail(str(error))
+        except SystemExit as end:
+            if end.code:
+                _suggest(argv, popped)
+            raise
+    result = [parsed.options]
+    if default is not None:
+        result.insert(0, _original(parsed.object))
+    return result
+
+
+def _suggest(argv: list[str], popped: tuple[str, ...]) -> None:
+    for token in argv:
+        close = difflib.get_close_matches(token.partition("=")[0], popped, n=1, cutoff=0.75)
+        if token.startswith("--") and "." not in token and close:
+            print(f"credo: {token}: did you mean {close[0]!r}?", file=sys.stderr)
+
+
+def _with_plain_task(value: Any) -> Any:
+    """`value` as a class whose `env` flags have no prefix; a wrapped task's own have none too."""
+    import tyro
+
+    cls: Any = type(value)
+    fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    if not dataclasses.is_dataclass(fields.get("env")):
+        return value
+    fields["env"] = _with_plain_task(fields["env"])
+    plain = Annotated[type(fields["env"]), tyro.conf.arg(name="")]
+    body = {
+        "__annotations__": {"env": plain},
+        "__module__": cls.__module__,
+        "__doc__": cls.__doc__,
+        "original": staticmethod(lambda: cls),
+    }
+    return type(cls)(cls.__name__, (cls,), body)(**fields)
+
+
+def _original(value: Any) -> Any:
+    if not hasattr(value, "original"):
+        return value
+    fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    return value.original()(**fields | {"env": _original(fields["env"])})

@@ -1,0 +1,107 @@
+"""When a run ends."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from .. import require
+
+DEFAULT = {"generations": 1000}
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """A run ends after the first generation that reaches one of these. None: no such limit."""
+
+    generations: int | None = None
+    frames: int | None = None  # environment steps of everything that played
+    stop_at: float | None = None  # champion score
+
+    def __post_init__(self):
+        for name in ("generations", "frames"):
+            if getattr(self, name) is not None:
+                require.at_least(name, getattr(self, name), 1)
+        if self.generations is None and self.frames is None:
+            raise ValueError("a run needs a budget: give generations, frames or both")
+
+    @classmethod
+    def of(
+        cls,
+        algorithm: Any,
+        generations: int | None = None,
+        frames: int | None = None,
+        stop_at: float | None = None,
+    ) -> "Budget":
+        """As given, or else the `default_budget` of the algorithm, an object or a class."""
+        if generations is None and frames is None:
+            return cls(**getattr(algorithm, "default_budget", DEFAULT), stop_at=stop_at)
+        # 1e6 is what people write.
+        whole = (None if x is None else int(x) for x in (generations, frames))
+        return cls(*whole, stop_at=stop_at)
+
+    @classmethod
+    def read(cls, record: dict[str, Any]) -> "Budget":
+        """As recorded in a config; those of older versions know no frames."""
+        return cls(**record)
+
+    def record(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+    @property
+    def stop_score(self) -> np.float32:
+        """NaN without one: no comparison with it ever stops."""
+        # The mean of 49 of 50 in float32 is a little less than 0.98.
+        return np.float32(np.nan if self.stop_at is None else self.stop_at - 1e-6)
+
+    def reached(self, generation: int, frames: int, score: float = -np.inf) -> str | None:
+        """Which limit ends the run, in words; None as long as it goes on."""
+        if self.frames is not None and frames >= self.frames:
+            return f"{frames:,} of {self.frames:,} frames"
+        if self.generations is not None and generation >= self.generations:
+            return f"{generation} of {self.generations} generations"
+        if score >= self.stop_score:
+            return f"champion score {score:.4g} of {self.stop_at:.4g}"
+        return None
+
+    def done(self, generation: int, frames: int) -> str:
+        """How far a run is, in the unit of its budget."""
+        if self.frames is not None:
+            return f"{short(frames)}/{short(self.frames)} frames"
+        return f"generation {generation}/{self.generations}"
+
+    def where(self, generation: int, frames: int) -> str:
+        """Where a run stopped, for a message."""
+        if self.generations is None:
+            return f"generation {generation}, {frames:,} of {self.frames:,} frames,"
+        return f"generation {generation} of {self.generations}"
+
+    def share(self, generation: int, frames: int) -> float:
+        """How far a run is, from 0 to 1."""
+        shares = [
+            done / limit
+            for done, limit in ((generation, self.generations), (frames, self.frames))
+            if limit is not None
+        ]
+        return min(1.0, max(shares))
+
+    def refuse_smaller(self, old: "Budget", generation: int, frames: int) -> None:
+        """Raise if this is no more than a run with the budget `old` was to do, or has done."""
+        for name, done in (("generations", generation), ("frames", frames)):
+            new, before = getattr(self, name), getattr(old, name)
+            if new is not None and before is not None and new < before:
+                raise ValueError(
+                    f"this run's budget is {before} {name}: a new budget must be larger, not {new}"
+                )
+            if new is not None and before is None and new < done:
+                raise ValueError(
+                    f"this run has done {done} {name}: a new budget must be larger, not {new}"
+                )
+
+
+def short(number: float) -> str:
+    """1234567 as `1.23M`."""
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if number >= size:
+            return f"{number / size:.3g}{unit}"
+    return f"{number:.3g}"
