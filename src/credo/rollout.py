@@ -160,28 +160,34 @@ def _collect(
     shape = (env.max_steps, pop, episodes)
     buffer = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape), x.dtype), blank(env))
     valid = jnp.zeros(shape, bool)
-    start = (jnp.int32(0), states, first.obs, carries, active, buffer, valid)
+    lost = jnp.zeros_like(active)  # as on the host: NaN in the buffer would spoil every learner
+    start = (jnp.int32(0), states, first.obs, carries, active, lost, buffer, valid)
 
     def ongoing(loop):
-        t, *_, active, _, _ = loop
+        t, *_, active, _, _, _ = loop
         return jnp.any(active) & (t < env.max_steps)
 
     def advance(loop):
-        t, states, obs, carries, active, buffer, valid = loop
+        t, states, obs, carries, active, lost, buffer, valid = loop
         actions, carries = _act(population, obs, carries)
+        nan = jnp.isnan(actions)
+        lost = lost | (active & jnp.any(nan.reshape(*lost.shape, -1), axis=2))
+        actions = jnp.where(nan, 0.0, actions)
         keys = _each(lambda key: jax.random.fold_in(key, t))(step_keys)
         states, step = _each(lambda s, a, key: env.step(s, a, key=key))(states, actions, keys)
         row = Transition(obs, actions, step.rewards, step.obs, step.terminated)
         buffer = jax.tree.map(lambda xs, x: xs.at[t].set(x), buffer, row)
         valid = valid.at[t].set(active)
         active = active & ~(step.terminated | step.truncated)
-        return t + 1, states, step.obs, carries, active, buffer, valid
+        return t + 1, states, step.obs, carries, active, lost, buffer, valid
 
-    *_, buffer, valid = jax.lax.while_loop(ongoing, advance, start)
+    *_, lost, buffer, valid = jax.lax.while_loop(ongoing, advance, start)
 
     def total(reward):
-        played = valid.reshape(valid.shape + (1,) * (reward.ndim - valid.ndim))
-        return jnp.sum(jnp.where(played, reward, jnp.zeros_like(reward)), axis=0)
+        team = (1,) * (reward.ndim - valid.ndim)
+        played = valid.reshape(valid.shape + team)
+        sum_ = jnp.sum(jnp.where(played, reward, jnp.zeros_like(reward)), axis=0)
+        return jnp.where(lost.reshape(lost.shape + team), jnp.nan, sum_)
 
     steps = jnp.sum(valid.astype(jnp.int32), axis=0)
     rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), buffer)
@@ -247,7 +253,8 @@ def _programs(structure, rest: tuple):
 
     def start(arrays, shape, common, key):
         world_key, policy_key = jax.random.split(key)
-        seeds = _each(jax.random.bits)(world_keys(*shape, common, key=world_key))
+        pop, episodes = shape
+        seeds = _each(jax.random.bits)(world_keys(pop, episodes, common, key=world_key))
         return seeds, _start(policies(arrays), jax.random.split(policy_key, shape))
 
     def act(arrays, obs, carry):

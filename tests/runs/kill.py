@@ -1,6 +1,6 @@
 """Kill a run at random moments, resume it each time, and compare it with one left alone.
 
-    python tests/runs/kill.py --kills 20
+    python tests/runs/kill.py --what erl --kills 20
 
 Half of the kills fall before a process trains (imports, the first checkpoint, compiling), half
 while it trains and writes; none after the run's end. What must agree, byte for byte: metrics,
@@ -16,31 +16,26 @@ import sys
 import tempfile
 import time
 
-TRAIN = [
-    "train",
-    "neuroevolution",
-    "sequence-classification",
-    "--depth",
-    "3",
-    "--min-gap",
-    "1",
-    "--max-gap",
-    "3",
-    "--population-size",
-    "20",
-    "--episodes",
-    "5",
-    "--network.hidden",
-    "3",
-]
+SMALL = (
+    "--network.hidden 8 --warmup-frames 200 --replay-capacity 5000 --test-every 3 "
+    "--updates-per-frame 0.02"
+)
+TRAIN = {
+    "neuroevolution": "neuroevolution sequence-classification --depth 3 --min-gap 1 --max-gap 3 "
+    "--population-size 20 --episodes 5 --network.hidden 3",
+    "erl": f"erl InvertedPendulum-v5 {SMALL} --sync-period 2",
+    "cerl": f"cerl InvertedPendulum-v5 {SMALL}",
+}
+GENERATIONS = {"neuroevolution": 100_000, "erl": 400, "cerl": 100}  # enough for 20 kills
 
 
-def start(run: pathlib.Path, generations: int) -> subprocess.Popen:
+def start(run: pathlib.Path, what: str, generations: int) -> subprocess.Popen:
     """Resume the run if there is one to resume, else train."""
     if (run / "config.json").exists():
         arguments = ["resume", str(run)]
     else:
-        arguments = [*TRAIN, "--generations", str(generations), "--path", str(run)]
+        arguments = ["train", *TRAIN[what].split(), "--generations", str(generations)]
+        arguments += ["--path", str(run)]
     return subprocess.Popen(
         [sys.executable, "-m", "credo.cli", *arguments, "--checkpoint-every", "0.05"],
         stdout=subprocess.PIPE,
@@ -49,8 +44,8 @@ def start(run: pathlib.Path, generations: int) -> subprocess.Popen:
     )
 
 
-def finish(run: pathlib.Path, generations: int) -> None:
-    process = start(run, generations)
+def finish(run: pathlib.Path, what: str, generations: int) -> None:
+    process = start(run, what, generations)
     output, _ = process.communicate()
     if process.returncode != 0:
         raise SystemExit(f"credo failed with exit code {process.returncode}:\n{output}")
@@ -69,10 +64,12 @@ def trains(process: subprocess.Popen, run: pathlib.Path, before: int) -> float:
     return time.monotonic() - began
 
 
-def kill_once(run: pathlib.Path, generations: int, starting: float, rng: random.Random) -> str:
+def kill_once(
+    run: pathlib.Path, what: str, generations: int, starting: float, rng: random.Random
+) -> str:
     """Start, wait for a random moment, SIGKILL. Says where the run then was."""
     began, before = time.monotonic(), rows(run)
-    process = start(run, generations)
+    process = start(run, what, generations)
     if rng.random() < 0.5:
         time.sleep(rng.uniform(0.0, starting))
     else:
@@ -101,31 +98,44 @@ def different(a: pathlib.Path, b: pathlib.Path) -> list[str]:
     ]
 
 
-def compare(folder: pathlib.Path, kills: int, generations: int, seed: int = 0) -> list[str]:
+def compare(
+    folder: pathlib.Path,
+    kills: int,
+    generations: int,
+    seed: int = 0,
+    what: str = "neuroevolution",
+) -> list[str]:
     """The files in which a run killed `kills` times differs from one left alone."""
     rng = random.Random(seed)
-    finish(folder / "first", 1)  # compiles, so that the next start takes as long as those killed
-    process = start(folder / "alone", generations)
+    finish(
+        folder / "first", what, 1
+    )  # compiles, so that the next start takes as long as those killed
+    process = start(folder / "alone", what, generations)
     starting = trains(process, folder / "alone", 0)
     output, _ = process.communicate()
     if process.returncode != 0:
         raise SystemExit(f"credo failed with exit code {process.returncode}:\n{output}")
     for i in range(kills):
-        where = kill_once(folder / "killed", generations, starting, rng)
+        where = kill_once(folder / "killed", what, generations, starting, rng)
         print(f"kill {i + 1:2d} {where}", flush=True)
-    finish(folder / "killed", generations)
+    finish(folder / "killed", what, generations)
     return different(folder / "alone", folder / "killed")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--what", choices=TRAIN, default="neuroevolution")
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--generations", type=int, default=100_000)
+    parser.add_argument("--generations", type=int, help="enough for all kills by default")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         found = compare(
-            pathlib.Path(folder), arguments.kills, arguments.generations, arguments.seed
+            pathlib.Path(folder),
+            arguments.kills,
+            arguments.generations or GENERATIONS[arguments.what],
+            arguments.seed,
+            arguments.what,
         )
     print(f"differing files: {', '.join(found) or 'none'}")
     raise SystemExit(bool(found))
