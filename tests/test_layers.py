@@ -7,7 +7,7 @@ import credo
 
 ROOT = pathlib.Path(credo.__file__).parent
 LEVELS = [
-    {"types", "tree", "compilation", "require"},
+    {"types", "tree", "compilation", "require", "runner"},
     {"environments", "networks"},
     {"rollout", "replay"},
     {"evolution", "learners"},

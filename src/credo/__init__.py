@@ -41,6 +41,18 @@ _EXPORTS = {
     "resume": "runs.loop",
     "Run": "runs.loop",
     "Policy": "runs.loop",
+    "ERL": "algorithms.erl",
+    "OffPolicy": "algorithms.off_policy",
+    "AbstractLearner": "learners.base",
+    "TD3": "learners.td3",
+    "ddpg": "learners.td3",
+    "SAC": "learners.sac",
+    "AbstractHostEnvironment": "environments.host",
+    "Gymnasium": "environments.gymnasium",
+    "delayed": "environments.wrappers",
+    "Runner": "runner",
+    "export": "runs.export",
+    "watch": "runs.watch",
 }
 __all__ = sorted(_EXPORTS)  # pyright: ignore[reportUnsupportedDunderAll]
 

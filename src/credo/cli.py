@@ -91,6 +91,8 @@ COMMANDS = {
     "train": "train an algorithm on a task: credo train neuroevolution sequence-classification",
     "resume": "go on with a run, also to a larger budget",
     "evaluate": "play fresh episodes with a run's champion",
+    "watch": "film a champion on a task of Gymnasium: credo watch RUN film.mp4",
+    "export": "a champion in one file that acts without JAX: credo export RUN policy.safetensors",
     "reproduce": "rerun a figure or table of the dissertation: credo reproduce fig-3.4a",
     "report": "one HTML page about one or more runs",
     "check": "look for mistakes in an environment: credo check my_module:MyTask",
@@ -329,6 +331,45 @@ def _evaluate(argv: list[str]) -> None:
 
         for line in evaluation.describe(run, task, options.episodes, options.seed):
             print(line)
+
+    _guarded(go)
+
+
+@dataclasses.dataclass
+class WatchOptions:
+    """Film episodes of a champion on a task of Gymnasium."""
+
+    episodes: int = 1  # one after the other
+    seed: int = 0  # of the first episode; the next ones count up
+    fps: float | None = None  # steps shown per second; None: in real time
+    size: tuple[int, int] = (480, 480)  # width and height in pixels, where a task lets us choose
+
+
+def _watch(argv: list[str]) -> None:
+    path, argv = _positional(argv, "watch RUN [FILM]", "the run's folder; film.gif or film.mp4")
+    film, argv = (argv[0], argv[1:]) if argv and not argv[0].startswith("-") else ("", argv)
+    (options,) = parse("credo watch RUN [FILM]", None, WatchOptions, argv)
+
+    def go() -> None:
+        from .runs import loop, watch
+
+        target = film or pathlib.Path(path) / "champion.gif"
+        print(f"film: {watch.watch(loop.Run(path), pathlib.Path(target), **vars(options))}")
+
+    _guarded(go)
+
+
+def _export(argv: list[str]) -> None:
+    path, argv = _positional(argv, "export RUN [FILE]", "the run's folder; policy.safetensors")
+    if len(argv) > 1 or argv[:1] in (["-h"], ["--help"]):
+        print("usage: credo export RUN [FILE]\n\n  the champion for credo.runner, without JAX")
+        raise SystemExit(0 if len(argv) == 1 else 2)
+
+    def go() -> None:
+        from .runs import export, loop
+
+        target = argv[0] if argv else pathlib.Path(path) / "policy.safetensors"
+        print(f"policy: {export.export(loop.Run(path), pathlib.Path(target))}")
 
     _guarded(go)
 

@@ -1,0 +1,23 @@
+"""Scripts that peers' own environments run, and how they are called."""
+
+import json
+import os
+import pathlib
+import subprocess
+
+FOLDER = pathlib.Path(__file__).parent
+VARIABLES = {"torch": "CREDO_PEER_TORCH", "sbx": "CREDO_PEER_SBX", "evorl": "CREDO_PEER_EVORL"}
+
+
+def ask(peer: str, script: str, *arguments: str) -> dict[str, float] | None:
+    """What a peer's script measured; None if its Python is not given."""
+    python = os.environ.get(VARIABLES[peer])
+    if not python:
+        print(f"  ({peer}: not measured; set {VARIABLES[peer]} to a Python that has it)")
+        return None
+    answer = subprocess.run(
+        [python, str(FOLDER / script), *arguments], capture_output=True, text=True
+    )
+    if answer.returncode:
+        raise RuntimeError(f"{script} failed:\n{answer.stderr[-2000:]}")
+    return json.loads(answer.stdout.splitlines()[-1])

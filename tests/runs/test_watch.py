@@ -1,0 +1,235 @@
+"""Films: what is drawn is what the champion does, and whatever is missing is named."""
+
+import os
+import re
+import subprocess
+import sys
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from credo.algorithms.neuroevolution import Neuroevolution
+from credo.environments.gymnasium import Gymnasium
+from credo.environments.sequence_recall import SequenceRecall
+from credo.environments.wrappers import DelayedHostReward
+from credo.networks.mlp import MLP
+from credo.networks.recurrent import Recurrent
+from credo.runs import checkpoint, config
+from credo.runs.loop import Run, RunError
+from credo.runs.watch import _write_mp4, watch
+
+LENGTH = 6
+
+
+class Painter(gymnasium.Env):
+    """Red is the step, green the seed, blue the last action; steps are never the same picture."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    observation_space = gymnasium.spaces.Box(0.0, 1.0, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(0.0, 200.0, (1,), np.float32)
+
+    def __init__(self, render_mode=None, width=8, height=8, raises="", dtype="uint8"):
+        self.render_mode, self.size = render_mode, (height, width)
+        self.raises, self.dtype = raises, dtype
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.seed, self.action = 0, seed, 0.0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t, self.action = self.t + 1, float(action[0])
+        return np.float32([self.t / LENGTH]), 0.0, False, False, {}
+
+    def render(self):
+        if self.raises:
+            raise RuntimeError(self.raises)
+        colour = (40 * self.t, self.seed, round(self.action))
+        return np.full((*self.size, 3), colour, self.dtype)
+
+
+class Fixed(Painter):
+    """Its size is its own."""
+
+    def __init__(self, render_mode=None):
+        super().__init__(render_mode, width=12, height=10)
+
+
+class Blind(Painter):
+    """It cannot draw."""
+
+    metadata = {"render_modes": ["human"]}
+
+
+def task(name="Painter", **kwargs):
+    return Gymnasium(f"test_watch:{name}", kwargs, max_episode_steps=LENGTH, in_process=True)
+
+
+def made(path, env, network=None) -> Run:
+    """A run on disk whose champion has fresh weights."""
+    path.mkdir()
+    network = network or MLP((3,))
+    algorithm = Neuroevolution(env, network, population_size=10)
+    policy = network.init(env.obs_size, env.action_size, key=jax.random.key(0))
+    checkpoint.export_policy(path / "champion.safetensors", policy)
+    config.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
+    return Run(path)
+
+
+def frames(path) -> tuple[np.ndarray, list[int]]:
+    """Pictures of a gif and milliseconds that each is shown."""
+    pictures, durations = [], []
+    with Image.open(path) as image:
+        for i in range(image.n_frames):
+            image.seek(i)
+            pictures.append(np.asarray(image.convert("RGB")))
+            durations.append(image.info["duration"])
+    return np.array(pictures), durations
+
+
+def test_a_film_shows_what_the_champion_does(tmp_path):
+    run = made(tmp_path / "run", DelayedHostReward(task()), Recurrent("gru", 3))
+    output = watch(run, tmp_path / "new" / "film.gif", episodes=2, seed=30, size=(20, 16))
+    pictures, durations = frames(output)
+    assert pictures.shape == (2 * (LENGTH + 1), 16, 20, 3)
+    assert set(durations) == {50}  # 20 steps per second
+    policy, expected = run.policy(), []
+    for seed in (30, 31):
+        policy.reset()
+        expected.append((0, seed, 0))
+        for t in range(LENGTH):
+            action = 100 + 100 * policy(np.float32([t / LENGTH]))[0]
+            expected.append((40 * (t + 1), seed, round(float(action))))
+    np.testing.assert_allclose(pictures[:, 8, 10], expected, atol=1)
+    assert sorted(p.name for p in output.parent.iterdir()) == ["film.gif"]
+
+
+def test_an_environment_may_have_a_size_of_its_own(tmp_path):
+    pictures, _ = frames(watch(made(tmp_path / "run", task("Fixed")), tmp_path / "film.gif"))
+    assert pictures.shape == (LENGTH + 1, 10, 12, 3)
+
+
+def test_a_faster_film_leaves_steps_out(tmp_path):
+    run = made(tmp_path / "run", task())
+    pictures, durations = frames(watch(run, tmp_path / "film.gif", fps=200))
+    assert pictures[:, 0, 0, 0].tolist() == [0, 160, 240]  # steps 0, 4 and the last
+    assert set(durations) == {20}
+    pictures, durations = frames(watch(run, tmp_path / "film.gif", fps=5))
+    assert len(pictures) == LENGTH + 1
+    assert set(durations) == {200}
+
+
+def test_an_mp4_has_the_same_pictures(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    run = made(tmp_path / "run", task())
+    output = watch(run, tmp_path / "film.mp4", seed=100, size=(65, 48))
+    command = [ffmpeg, "-i", output, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    result = subprocess.run(command, capture_output=True, check=True)
+    assert re.search(r"h264.* 64x48.* 20 fps", result.stderr.decode())
+    pictures = np.frombuffer(result.stdout, np.uint8).reshape(-1, 48, 64, 3)
+    red = pictures[:, 24, 32, 0].astype(int)
+    np.testing.assert_allclose(red, [40 * t for t in range(LENGTH + 1)], atol=12)
+
+
+def test_what_ffmpeg_refuses_is_told(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    pictures = iter([np.zeros((4, 4, 3), np.uint8)] * 3)
+    with pytest.raises(RunError, match=r"ffmpeg says .*No such file or directory"):
+        _write_mp4(tmp_path / "nowhere" / "film.mp4", pictures, 10)
+
+
+def test_without_ffmpeg_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    run = made(tmp_path / "run", task())
+    with pytest.raises(RunError, match=r'pip install "credo\[video\]"`, or ask for a \.gif'):
+        watch(run, tmp_path / "film.mp4")
+
+
+def test_our_own_tasks_have_nothing_to_draw(tmp_path):
+    run = made(tmp_path / "run", SequenceRecall(depth=2))
+    with pytest.raises(RunError, match=r"nothing to draw.*`credo report .*run` shows"):
+        watch(run, tmp_path / "film.gif")
+
+
+@pytest.mark.parametrize(
+    ("env", "told"),
+    [
+        (task("Blind"), r"must take render_mode.*it names \['human'\]"),
+        (task(raises="no screen"), r"RuntimeError: no screen\): install what it names, or mend"),
+        (task(dtype="float32"), "dtype float32: its render"),
+    ],
+    ids=["mode", "raises", "dtype"],
+)
+def test_what_cannot_be_drawn_says_why_and_leaves_no_file(tmp_path, env, told):
+    run = made(tmp_path / "run", env)
+    with pytest.raises(RunError, match=told):
+        watch(run, tmp_path / "film.gif")
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"output": "film.avi"}, r"'film\.avi': its name must end in \.mp4 or \.gif"),
+        ({"episodes": 0}, "episodes is 0"),
+        ({"fps": 0}, "fps is 0"),
+        ({"size": (0, 10)}, "width is 0"),
+    ],
+)
+def test_wrong_arguments_are_told(tmp_path, wrong, told):
+    run = made(tmp_path / "run", task())
+    with pytest.raises(ValueError, match=told):
+        watch(run, **{"output": tmp_path / "film.gif"} | wrong)
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
+HOPPER = """
+import sys, pathlib
+from credo.environments.gymnasium import Gymnasium
+from test_watch import made
+from credo.runs.loop import RunError
+from credo.runs.watch import watch
+folder = pathlib.Path(sys.argv[1])
+run = made(folder / "run", Gymnasium("Hopper-v5", max_episode_steps=9, in_process=True))
+try:
+    watch(run, folder / "film.gif", size=(64, 48))
+except RunError as error:
+    print(error)
+"""
+PLAIN = """
+import gymnasium
+env = gymnasium.make("Hopper-v5", render_mode="rgb_array")
+env.reset(seed=0)
+print(env.render().shape)
+"""
+
+
+def drawn_with(renderer, code, *arguments):
+    """The output of Python code where MuJoCo draws through `renderer`."""
+    environment = os.environ | {"MUJOCO_GL": renderer, "PYTHONPATH": os.path.dirname(__file__)}
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment)
+
+
+def test_mujoco_is_drawn_at_the_size_asked_for(tmp_path):
+    pytest.importorskip("mujoco")
+    result = drawn_with("egl", HOPPER, tmp_path)
+    if result.stdout and drawn_with("egl", PLAIN).returncode != 0:
+        pytest.skip("MuJoCo cannot draw through EGL on this machine, also without Credo")
+    assert (result.returncode, result.stdout) == (0, ""), result.stderr
+    pictures, durations = frames(tmp_path / "film.gif")
+    assert pictures.shape == (4, 48, 64, 3)  # steps 0, 3, 6 and 9 of 125 per second
+    assert set(durations) == {20}
+    assert pictures[0].std() > 20
+    assert np.abs(pictures[0].astype(int) - pictures[-1]).max() > 20  # it moved
+
+
+def test_where_mujoco_cannot_draw_the_variable_to_set_is_named(tmp_path):
+    pytest.importorskip("mujoco")
+    result = drawn_with("disable", HOPPER, tmp_path)
+    assert "Hopper-v5 cannot be drawn here" in result.stdout, result.stderr
+    assert "set the environment variable MUJOCO_GL=egl" in result.stdout
+    assert not (tmp_path / "film.gif").exists()
