@@ -1,4 +1,5 @@
-"""Rollouts: the fast path for sequences plays what `episode` plays, step by step."""
+"""Rollouts: the fast path for sequences plays what `episode` plays, step by step, and so does
+whoever collects transitions, inside JAX and outside."""
 
 from typing import ClassVar
 
@@ -7,12 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import compilations
+from walk import START, HostWalk, Walk
 
 from credo import rollout, tree
 from credo.environments.probes import Copy, Meet, Remember
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
+from credo.environments.wrappers import delayed
 from credo.networks.base import AbstractPolicy
+from credo.networks.exploration import Explorer, GaussianNoise
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
@@ -248,3 +253,187 @@ def test_the_carry_lives_for_one_episode():
         env, Counter(), world_key=jax.random.key(0), policy_key=jax.random.key(2)
     )
     assert float(returns["reward"]) == float(again["reward"]) < 0.0
+
+
+# Transitions: the same episodes as `evaluate`, frame by frame.
+
+
+@pytest.fixture(scope="module")
+def walkers():
+    """Members that end early, late, or never."""
+    return tree.stack(*(leaning(bias) for bias in (0.9, 0.02, -0.3)))
+
+
+def leaning(bias):
+    """A small network that mostly walks one way."""
+    policy = MLP(hidden=(3,), initializer="uniform", output_scale=0.1).init(
+        2, 1, key=jax.random.key(0)
+    )
+    return eqx.tree_at(lambda p: p.weights["b_1"], policy, jnp.array([bias]))
+
+
+def lanes(experience, pop=POP):
+    """Rows, episode by episode: `[lane][step]`."""
+    rows = jax.tree.map(np.asarray, experience.transitions)
+    if experience.valid is None:
+        return rows
+    shape = (pop * EPISODES, -1)
+    valid = np.asarray(experience.valid).reshape(shape)
+    rows = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), rows)
+    return [jax.tree.map(lambda x, i=i: x[i, valid[i]], rows) for i in range(len(valid))]
+
+
+def rows_of(experience):
+    if experience.valid is None:
+        return len(experience.transitions.obs)
+    return int(jnp.sum(experience.valid))
+
+
+@pytest.mark.parametrize(
+    ("env", "name", "common"),
+    [
+        (Walk(), "mlp", True),
+        (Copy(max_steps=3), "rnn", False),
+        (Remember(delay=2), "rnn", True),
+    ],
+    ids=lambda x: str(x) if isinstance(x, str | bool) else type(x).__name__,
+)
+def test_collecting_changes_neither_returns_nor_steps(env, name, common):
+    population, key = population_of(env, NETWORKS[name]), jax.random.key(7)
+    played = rollout.evaluate(env, population, EPISODES, common=common, key=key)
+    collected, experience = rollout.collect(env, population, EPISODES, common=common, key=key)
+    assert_same(played, collected)
+    assert int(jnp.sum(experience.valid)) == int(jnp.sum(played.steps))
+    for lane, steps in zip(lanes(experience), np.asarray(played.steps).ravel(), strict=True):
+        assert len(lane.obs) == steps
+
+
+def test_noise_too_is_the_same_when_it_is_collected(walkers):
+    explorers = Explorer(walkers, GaussianNoise(0.3), jnp.zeros(POP, bool), 1)
+    explorers = eqx.tree_at(lambda e: e.noise.std, explorers, jnp.full(POP, 0.3))
+    key = jax.random.key(1)
+    played = rollout.evaluate(Walk(), explorers, EPISODES, key=key)
+    collected, _ = rollout.collect(Walk(), explorers, EPISODES, key=key)
+    assert_same(played, collected)
+    assert len(np.unique(played.returns["reward"])) == POP * EPISODES
+
+
+def test_rows_are_the_episodes_frame_by_frame(walkers):
+    played, experience = rollout.collect(Walk(), walkers, EPISODES, key=jax.random.key(0))
+    steps = np.asarray(played.steps).ravel()
+    ends = []
+    for i, lane in enumerate(lanes(experience)):
+        np.testing.assert_allclose(lane.obs[0], [START, 0.0])
+        np.testing.assert_array_equal(lane.next_obs[:-1], lane.obs[1:])
+        np.testing.assert_allclose(lane.next_obs[:, 1], 0.1 * np.arange(1, steps[i] + 1), rtol=1e-6)
+        np.testing.assert_allclose(lane.next_obs[:, 0], lane.rewards["reward"])
+        policy = tree.take(walkers, i // EPISODES)
+        expected = policy(jnp.asarray(lane.obs.T), ())[0].T
+        np.testing.assert_allclose(lane.action, expected, atol=1e-6)
+        for name, rewards in lane.rewards.items():
+            total = float(np.asarray(played.returns[name]).ravel()[i])
+            assert rewards.sum() == pytest.approx(total, rel=1e-5)
+        # After the clock alone, learners bootstrap.
+        assert not lane.terminated[:-1].any()
+        assert lane.terminated[-1] == (np.abs(lane.next_obs[-1, 0]) > 1.0)
+        assert lane.terminated[-1] or steps[i] == Walk.max_steps
+        ends.append(bool(lane.terminated[-1]))
+    assert len(set(ends)) == 2  # both ways to end were seen
+
+
+@pytest.mark.parametrize("env", [Walk(), HostWalk()], ids=["jax", "host"])
+def test_the_episodes_wanted_are_data(walkers, env):
+    key = jax.random.key(0)
+    every, _ = rollout.collect(env, walkers, EPISODES, common=False, key=key)
+    rollout.collect(env, walkers, EPISODES, wanted=jnp.int32(4), common=False, key=key)
+    with compilations() as events:
+        some = [
+            rollout.collect(env, walkers, EPISODES, wanted=n, common=False, key=key)
+            for n in map(jnp.int32, (0, 1, 3))
+        ]
+        jax.block_until_ready([evaluation for evaluation, _ in some])
+    assert events == []
+    for n, (played, experience) in zip((0, 1, 3), some, strict=True):
+        np.testing.assert_array_equal(played.steps[:, :n], every.steps[:, :n])
+        assert not np.any(played.steps[:, n:])
+        for name, returns in played.returns.items():
+            np.testing.assert_allclose(returns[:, :n], every.returns[name][:, :n], rtol=1e-5)
+            assert not np.any(returns[:, n:])
+        assert rows_of(experience) == int(jnp.sum(played.steps))
+
+
+def test_a_team_is_collected_with_its_private_rewards():
+    teams = tree.stack(Towards(jnp.array([1.0, 1.0])), Towards(jnp.array([1.0, 0.0])))
+    key = jax.random.key(0)
+    played = rollout.evaluate(Meet(), teams, 2, key=key)
+    collected, experience = rollout.collect(Meet(), teams, 2, key=key)
+    assert_same(played, collected)
+    assert experience.transitions.rewards["local"].shape[1:] == (2,)
+    assert experience.transitions.obs.shape[1:] == (2, 2)
+    assert int(jnp.sum(experience.transitions.terminated & experience.valid)) == 2
+
+
+def test_a_host_task_plays_as_the_same_task_in_jax(walkers):
+    key = jax.random.key(0)
+    inside, frames = rollout.collect(Walk(), walkers, EPISODES, key=key)
+    outside, rows = rollout.collect(HostWalk(), walkers, EPISODES, key=key)
+    assert_same(inside, outside)
+    assert_same(inside, rollout.evaluate(HostWalk(), walkers, EPISODES, key=key))
+    assert rows.valid is None
+    valid = np.asarray(frames.valid)
+    for x, y in zip(
+        jax.tree.leaves(frames.transitions), jax.tree.leaves(rows.transitions), strict=True
+    ):
+        assert x.dtype == y.dtype
+        np.testing.assert_allclose(np.asarray(x)[valid], y, atol=1e-5)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), rollout.blank(HostWalk())) == jax.tree.map(
+        lambda x: (x.shape, x.dtype), rollout.blank(Walk())
+    )
+
+
+@pytest.mark.parametrize("env", [Walk(), HostWalk()], ids=["jax", "host"])
+def test_a_member_that_acts_nan_has_a_nan_return_and_spoils_nobody_else(env):
+    population = tree.stack(*(Constant(jnp.array([a])) for a in (0.1, jnp.nan, -0.1)))
+    played, experience = rollout.collect(env, population, 2, key=jax.random.key(0))
+    for returns in played.returns.values():
+        assert np.isnan(returns).tolist() == [[False] * 2, [True] * 2, [False] * 2]
+    assert np.isfinite(np.asarray(played.steps)).all()
+    rows = jax.tree.map(np.asarray, experience.transitions)
+    for leaf in jax.tree.leaves(rows):
+        kept = leaf if experience.valid is None else leaf[np.asarray(experience.valid)]
+        assert np.isfinite(kept).all()  # learners would never recover
+
+
+def test_seeds_of_a_host_task_follow_the_key():
+    env = HostWalk(spread=0.5)
+    twins = constants(0.1, 0.1)
+
+    def starts(seed, common):
+        played, experience = rollout.collect(
+            env, twins, EPISODES, common=common, key=jax.random.key(seed)
+        )
+        assert np.all(np.asarray(played.steps) == env.max_steps)
+        return np.asarray(experience.transitions.obs).reshape(2, EPISODES, -1, 2)[:, :, 0, 0]
+
+    same, own = starts(0, True), starts(0, False)
+    np.testing.assert_array_equal(same[0], same[1])
+    assert len(np.unique(same)) == EPISODES
+    assert len(np.unique(own)) == 2 * EPISODES
+    np.testing.assert_array_equal(own, starts(0, False))
+    assert not np.isin(own, starts(1, False)).any()
+
+
+@pytest.mark.parametrize("env", [Walk(), HostWalk()], ids=["jax", "host"])
+def test_a_delayed_task_pays_in_the_last_row(walkers, env):
+    key = jax.random.key(0)
+    plain, frames = rollout.collect(env, walkers, EPISODES, key=key)
+    late, experience = rollout.collect(delayed(env), walkers, EPISODES, key=key)
+    assert_same(plain, late)
+    valid = slice(None) if frames.valid is None else np.asarray(frames.valid)
+    before, after = (
+        jax.tree.map(lambda x: np.asarray(x)[valid], e.transitions) for e in (frames, experience)
+    )
+    assert len(after.obs) == int(jnp.sum(plain.steps))
+    assert np.count_nonzero(after.rewards["reward"]) == POP * EPISODES
+    np.testing.assert_array_equal(after.obs, before.obs)
+    np.testing.assert_array_equal(after.terminated, before.terminated)

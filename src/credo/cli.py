@@ -49,6 +49,9 @@ ALGORITHMS = {
         }.items()
     },
 }
+ALGORITHMS["ppo"] = Entry(
+    "credo.algorithms.ppo:PPO", "ppo", None, "proximal policy optimization, on fresh frames alone"
+)
 TASKS = {
     "sequence-classification": (
         "credo.environments.sequence_classification:SequenceClassification",

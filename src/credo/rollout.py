@@ -19,7 +19,7 @@ Environment = AbstractEnvironment | AbstractHostEnvironment
 
 
 class Experience(eqx.Module):
-    """What happened in a rollout, frame by frame."""
+    """What happened in a rollout, frame by frame and episode by episode."""
 
     transitions: Transition  # leaves [rows, ...]
     valid: Bool[Array, " rows"] | None  # None: every row, which then come from the host
@@ -128,7 +128,7 @@ def episode(
         state, time_step, carry, returns, steps = loop
         action, carry = policy(time_step.obs, carry)
         key = jax.random.fold_in(step_key, steps)
-        state, time_step = env.step(state, action, key=key)
+        state, time_step = env.step(state, jnp.clip(action, -1.0, 1.0), key=key)
         returns = jax.tree.map(jnp.add, returns, time_step.rewards)
         return state, time_step, carry, returns, steps + 1
 
@@ -174,7 +174,8 @@ def _collect(
         lost = lost | (active & jnp.any(nan.reshape(*lost.shape, -1), axis=2))
         actions = jnp.where(nan, 0.0, actions)
         keys = _each(lambda key: jax.random.fold_in(key, t))(step_keys)
-        states, step = _each(lambda s, a, key: env.step(s, a, key=key))(states, actions, keys)
+        bounded = jnp.clip(actions, -1.0, 1.0)
+        states, step = _each(lambda s, a, key: env.step(s, a, key=key))(states, bounded, keys)
         row = Transition(obs, actions, step.rewards, step.obs, step.terminated)
         buffer = jax.tree.map(lambda xs, x: xs.at[t].set(x), buffer, row)
         valid = valid.at[t].set(active)
@@ -190,9 +191,12 @@ def _collect(
         return jnp.where(lost.reshape(lost.shape + team), jnp.nan, sum_)
 
     steps = jnp.sum(valid.astype(jnp.int32), axis=0)
-    rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), buffer)
     returns = jax.tree.map(total, buffer.rewards)
-    return Evaluation(returns, steps), Experience(rows, valid.reshape(-1))
+
+    def flat(x):
+        return jnp.moveaxis(x, 0, 2).reshape(-1, *x.shape[3:])
+
+    return Evaluation(returns, steps), Experience(jax.tree.map(flat, buffer), flat(valid))
 
 
 def _collect_on_host(
@@ -237,7 +241,7 @@ def _collect_on_host(
     steps = jnp.asarray(valid.sum(axis=0, dtype=np.int32).reshape(pop, episodes))
 
     def kept(x):
-        return x[valid].astype(np.float32 if x.dtype == np.float64 else x.dtype)
+        return x.swapaxes(0, 1)[valid.T].astype(np.float32 if x.dtype == np.float64 else x.dtype)
 
     return Evaluation(returns, steps), Experience(jax.tree.map(kept, lanes), None)
 

@@ -28,7 +28,6 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
 from ..compilation import jit
-from ..environments.host import AbstractHostEnvironment
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.lineage import Lineage
 from ..evolution.mutation import AbstractMutation, MatrixMutation
@@ -224,7 +223,7 @@ class ERL(eqx.Module):
             metrics |= {f"workers_{i}": workers, f"value_{i}": ledger.value[i]}
 
         # 21-29: as many updates as frames, each learner on minibatches of its own.
-        ready = state.frames >= self.warmup_frames
+        ready = (state.frames >= self.warmup_frames) & bool(self.learners)
         updates = jnp.where(ready, frames.astype(jnp.float32) * self.updates_per_frame, 0.0)
         updates = updates.astype(jnp.int32)
         learners = []
@@ -258,7 +257,6 @@ class ERL(eqx.Module):
             (generation - 1) % self.test_every == 0,
             lambda: jnp.mean(self.test(champion, key=test_key)),
             lambda: state.score,
-            host=isinstance(self.env, AbstractHostEnvironment),
         )
         metrics |= bred | {
             "fitness_max": jnp.max(rankable(fitness)),

@@ -10,11 +10,11 @@ from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
-from ..environments.host import AbstractHostEnvironment
 from ..learners.base import AbstractLearner, learn
 from ..learners.sac import SAC
 from ..learners.td3 import TD3, ddpg
@@ -122,7 +122,6 @@ class OffPolicy(eqx.Module):
             due,
             lambda: jnp.mean(self.test(actor, key=test_key)),
             lambda: state.score,
-            host=isinstance(self.env, AbstractHostEnvironment),
         )
         returns = played.returns[self.learner.signal or signal]
         metrics |= {
@@ -141,11 +140,11 @@ class OffPolicy(eqx.Module):
         return played.returns[self.env.signals[-1]]
 
 
-def when(due: Any, play: Callable, skip: Callable, *, host: bool) -> Any:
-    """`play()` if `due`, else `skip()`; a host environment cannot be part of a program."""
-    if host:
-        return play() if due else skip()
-    return jax.lax.cond(due, play, skip)
+def when(due: Any, play: Callable, skip: Callable) -> Any:
+    """`play()` if `due`, else `skip()`; as part of a program only where `due` is traced."""
+    if isinstance(due, jax.core.Tracer):
+        return jax.lax.cond(due, play, skip)
+    return play() if due else skip()
 
 
 def _given(**fields) -> dict[str, Any]:

@@ -20,7 +20,7 @@ class Lineage(eqx.Module):
     @classmethod
     def first(cls, pop: int, q: int) -> "Lineage":
         share = jnp.zeros((pop, 1 + q)).at[:, 0].set(1.0)
-        return cls(jnp.full(pop, DRAWN), share, jnp.full(pop, -1))
+        return cls(jnp.full(pop, DRAWN, jnp.int32), share, jnp.full(pop, -1, jnp.int32))
 
     def children(
         self,
@@ -42,7 +42,7 @@ class Lineage(eqx.Module):
         return Lineage(
             jnp.concatenate([self.maker[elites], made]),
             jnp.concatenate([self.share[elites], share]),
-            jnp.full(self.guest.shape, -1),
+            jnp.full_like(self.guest, -1),
         )
 
     def inject(self, slot: int, learner: int) -> "Lineage":

@@ -59,6 +59,8 @@ class Explorer(AbstractPolicy):
     noise: AbstractNoise
     random: Bool[Array, ""]  # draw actions uniformly from [-1, 1]
     action_size: int = eqx.field(static=True)
+    clipped: bool = eqx.field(static=True, default=True)
+    """Clip actions to [-1, 1] here; else the rollout does, and the transition has what was said."""
     features_first: ClassVar[bool] = False
 
     def start(self, *, key: PRNGKeyArray) -> PyTree:
@@ -71,5 +73,7 @@ class Explorer(AbstractPolicy):
         action, carry = self.policy(obs, carry)
         noise, before = self.noise(before, key=noise_key)
         drawn = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
-        action = jnp.where(self.random, drawn, jnp.clip(action + noise, -1.0, 1.0))
-        return action, (carry, before, key)
+        action = action + noise
+        if self.clipped:
+            action = jnp.clip(action, -1.0, 1.0)
+        return jnp.where(self.random, drawn, action), (carry, before, key)

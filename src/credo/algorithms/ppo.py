@@ -1,0 +1,263 @@
+"""PPO: Schulman et al. (2017), Algorithm 1, with the clipped objective (equation 7) and
+generalized advantages (equation 11): the on-policy baseline of Chapter 5.
+
+Departures: a generation plays whole episodes, as many as last time's length says `horizon` frames
+need, so that its end is a state to resume from. Observations and rewards are not normalised, which
+most implementations do in silence: the policy acts on what the task says.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from .. import require, tree
+from ..compilation import jit
+from ..learners.base import act, adam, adam_state, require_memoryless
+from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.exploration import Explorer, GaussianNoise
+from ..networks.mlp import MLP, Critic, CriticNetwork
+from ..replay import Replay, extend
+from ..rollout import Environment, blank, collect, evaluate
+from ..types import Metrics, Transition
+from .off_policy import when
+
+
+class Actor(eqx.Module):
+    """A Gaussian around a policy's action; its spread is the same everywhere."""
+
+    mean: AbstractPolicy
+    log_std: Float[Array, " act"]
+
+    def log_density(
+        self, obs: Float[Array, "batch obs"], action: Float[Array, "batch act"]
+    ) -> Float[Array, " batch"]:
+        z = (action - act(self.mean, obs)) / jnp.exp(self.log_std)[None]
+        each = -0.5 * jnp.square(z) - self.log_std[None] - 0.5 * jnp.log(2.0 * jnp.pi)
+        return jnp.sum(each, axis=1)
+
+
+class Sample(eqx.Module):
+    """What an update learns from, one row per frame."""
+
+    obs: Float[Array, "rows obs"]
+    action: Float[Array, "rows act"]
+    log_density: Float[Array, " rows"]  # of the action when it was drawn
+    advantage: Float[Array, " rows"]
+    value: Float[Array, " rows"]  # what the critic should have said
+
+
+class PPOState(eqx.Module):
+    actor: Actor
+    critic: CriticNetwork
+    optimizer: optax.OptState
+    replay: Replay  # the frames of one generation
+    champion: AbstractPolicy
+    score: Float[Array, ""]
+    length: Float[Array, ""]  # mean frames of an episode, last time
+    frames: Int[Array, ""]
+
+
+class PPO(eqx.Module):
+    """Train a policy on its own fresh experience alone."""
+
+    default_budget: ClassVar[dict[str, int]] = {"frames": 1_000_000}
+
+    env: Environment
+    network: AbstractNetwork = MLP(
+        hidden=(64, 64), activation="tanh", initializer="fan_in", output_scale=0.01
+    )
+    critic: Critic = Critic(hidden=(64, 64), activation="tanh", initializer="fan_in")
+    horizon: int = eqx.field(static=True, default=2048)  # frames between updates, about
+    copies: int = eqx.field(static=True, default=32)  # episodes between updates, at most
+    epochs: int = eqx.field(static=True, default=10)  # passes over the frames
+    batch_size: int = eqx.field(static=True, default=64)  # frames per update
+    gamma: float = 0.99  # discount per step, in [0, 1]
+    gae: float = 0.95  # λ of generalized advantages, in [0, 1]
+    clip: float = 0.2  # ε: how far a probability ratio counts
+    learning_rate: float = 3e-4  # of Adam
+    value_weight: float = 0.5  # of the critic's squared error
+    max_norm: float = 0.5  # of the gradient
+    first_std: float = 0.6  # of the noise at first, in units of actions
+    test_episodes: int = eqx.field(static=True, default=10)  # without noise; not counted
+    test_every: int = eqx.field(static=True, default=5_000)  # frames between tests
+    signal: str | None = eqx.field(static=True, default=None)  # reward; None: the task's first
+
+    def __check_init__(self):
+        for name in ("horizon", "copies", "epochs", "batch_size", "test_episodes", "test_every"):
+            require.at_least(name, getattr(self, name), 1)
+        for name in ("gamma", "gae"):
+            require.within(name, getattr(self, name), 0, 1)
+        for name in ("clip", "learning_rate", "value_weight", "max_norm", "first_std"):
+            require.at_least(name, getattr(self, name), 0)
+        require.signal(self.signal, self.env.signals)
+
+    @classmethod
+    def ppo(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """The constants of its authors for MuJoCo."""
+        given: dict[str, Any] = {} if network is None else {"network": network}
+        return cls(env, **given | overrides)
+
+    @classmethod
+    def presets(cls) -> dict[str, Callable[..., Self]]:
+        """Settings by name, for the command line."""
+        return {"ppo": cls.ppo}
+
+    def init(self, *, key: PRNGKeyArray) -> PPOState:
+        env = self.env
+        actor_key, critic_key = jax.random.split(key)
+        mean = self.network.init(env.obs_size, env.action_size, key=actor_key)
+        require_memoryless(self.network, mean)
+        actor = Actor(mean, jnp.full(env.action_size, jnp.log(self.first_std)))
+        critic = self.critic.init(env.obs_size, 0, key=critic_key)  # a value of states
+        # Room for a round of episodes that are all much longer than the last ones.
+        most = self.copies * env.max_steps
+        replay = Replay.empty(blank(env), min(most, self.horizon + 8 * env.max_steps))
+        opt = adam_state((actor, critic))
+        length = jnp.float32(self.horizon / self.copies)
+        score = jnp.float32(jnp.nan)
+        return PPOState(actor, critic, opt, replay, mean, score, length, jnp.int32(0))
+
+    def generation(self, state: PPOState, *, key: PRNGKeyArray) -> tuple[PPOState, Metrics]:
+        explore_key, learn_key, test_key = jax.random.split(key, 3)
+
+        # Run the policy for about T frames.
+        wanted = jnp.clip(jnp.ceil(self.horizon / state.length).astype(jnp.int32), 1, self.copies)
+        noise = GaussianNoise(jnp.exp(state.actor.log_std))  # pyright: ignore[reportArgumentType]
+        explorer = Explorer(
+            state.actor.mean, noise, jnp.bool_(False), self.env.action_size, clipped=False
+        )
+        played, experience = collect(
+            self.env,
+            tree.stack(explorer),
+            self.copies,
+            wanted=wanted,
+            common=False,
+            key=explore_key,
+        )
+        empty = Replay(state.replay.data, jnp.int32(0))
+        replay = extend(empty, experience.transitions, experience.valid)
+        new = jnp.sum(played.steps)
+        frames = state.frames + new
+
+        # Compute advantages; optimize the surrogate with K epochs of minibatches.
+        actor, critic, opt, metrics = improve(self, state, replay, key=learn_key)
+
+        due = (frames // self.test_every > state.frames // self.test_every) | (state.frames == 0)
+        score = when(
+            due,
+            lambda: jnp.mean(self.test(actor.mean, key=test_key)),
+            lambda: state.score,
+        )
+        returns = played.returns[self.signal or self.env.signals[0]][0]
+        counts = jnp.arange(self.copies) < wanted
+        metrics |= {
+            "fitness_max": jnp.max(jnp.where(counts, returns, -jnp.inf)),
+            "fitness_mean": jnp.sum(returns) / wanted.astype(jnp.float32),
+            "champion_score": score,
+            "frames": new,
+        }
+        champion = tree.where(due, actor.mean, state.champion)
+        length = new.astype(jnp.float32) / wanted.astype(jnp.float32)
+        return PPOState(actor, critic, opt, replay, champion, score, length, frames), metrics
+
+    def warm(self, state: PPOState, policy: AbstractPolicy) -> PPOState:
+        """`state` that goes on from a saved policy of the same network."""
+        return eqx.tree_at(lambda s: s.actor.mean, state, policy)
+
+    def test(self, actor: AbstractPolicy, *, key: PRNGKeyArray) -> Float[Array, "1 episodes"]:
+        """Returns of the signal that is reported, without noise."""
+        played = evaluate(self.env, tree.stack(actor), self.test_episodes, key=key)
+        return played.returns[self.env.signals[-1]]
+
+
+@jit
+def improve(
+    ppo: PPO, state: PPOState, replay: Replay, *, key: PRNGKeyArray
+) -> tuple[Actor, CriticNetwork, optax.OptState, Metrics]:
+    """K epochs of minibatches of M frames. How many frames there are is data."""
+    sample = prepare(ppo, state, replay)
+    batches = replay.size // ppo.batch_size
+    weights, static = eqx.partition((state.actor, state.critic), eqx.is_inexact_array)
+
+    def epoch(k, loop):
+        # A permutation of the frames, in minibatches; what is left over is left out.
+        u = jax.random.uniform(jax.random.fold_in(key, k), (replay.capacity,))
+        order = jnp.argsort(jnp.where(jnp.arange(replay.capacity) < replay.size, u, 2.0))
+
+        def step(i, loop):
+            weights, opt, total = loop
+            index = jax.lax.dynamic_slice_in_dim(order, i * ppo.batch_size, ppo.batch_size)
+            rows = jax.tree.map(lambda x: x[index], sample)
+            (_, metrics), gradient = jax.value_and_grad(
+                lambda w: surrogate(ppo, eqx.combine(w, static), rows), has_aux=True
+            )(weights)
+            weights, opt = adam(weights, gradient, opt, ppo.learning_rate, ppo.max_norm)
+            return weights, opt, jax.tree.map(jnp.add, total, metrics)
+
+        return jax.lax.fori_loop(0, batches, step, loop)
+
+    zeros = {name: jnp.float32(0.0) for name in ("policy_loss", "critic_loss", "clipped")}
+    loop = jax.lax.fori_loop(0, ppo.epochs, epoch, (weights, state.optimizer, zeros))
+    weights, opt, total = loop
+    actor, critic = eqx.combine(weights, static)
+    count = (ppo.epochs * batches).astype(jnp.float32)
+    return actor, critic, opt, {name: x / count for name, x in total.items()}
+
+
+def prepare(ppo: PPO, state: PPOState, replay: Replay) -> Sample:
+    """Advantages by equation 11 and what goes with them, normalised over the frames."""
+    rows: Transition = replay.data
+    filled = jnp.arange(replay.capacity) < replay.size
+    reward = rows.rewards[ppo.signal or ppo.env.signals[0]]
+    value, after = (_value(state.critic, obs) for obs in (rows.obs, rows.next_obs))
+    delta = reward + ppo.gamma * jnp.where(rows.terminated, 0.0, after) - value
+    # An episode goes on in the next row if that begins where this one ends.
+    follows = jnp.all(rows.next_obs[:-1] == rows.obs[1:], axis=1) & ~rows.terminated[:-1]
+    goes_on = jnp.append(follows, False) & jnp.append(filled[1:], False)
+    advantage = advantages(delta, goes_on, ppo.gamma * ppo.gae)
+    n = jnp.maximum(replay.size, 1).astype(jnp.float32)
+    mean = jnp.sum(jnp.where(filled, advantage, 0.0)) / n
+    variance = jnp.sum(jnp.where(filled, jnp.square(advantage - mean), 0.0)) / n
+    return Sample(
+        rows.obs,
+        rows.action,
+        state.actor.log_density(rows.obs, rows.action),
+        (advantage - mean) / (jnp.sqrt(variance) + 1e-8),
+        advantage + value,
+    )
+
+
+def advantages(
+    delta: Float[Array, " rows"], goes_on: Bool[Array, " rows"], decay: Any
+) -> Float[Array, " rows"]:
+    """A_t = δ_t + γλ A_{t+1}, up to the end of each episode."""
+
+    def back(later, row):
+        δ, more = row
+        now = δ + decay * jnp.where(more, later, 0.0)
+        return now, now
+
+    return jax.lax.scan(back, jnp.float32(0.0), (delta, goes_on), reverse=True)[1]
+
+
+def surrogate(
+    ppo: PPO, networks: tuple[Actor, CriticNetwork], rows: Sample
+) -> tuple[Float[Array, ""], Metrics]:
+    """Minus the clipped objective (equation 7) and the critic's squared error."""
+    actor, critic = networks
+    ratio = jnp.exp(actor.log_density(rows.obs, rows.action) - rows.log_density)
+    bounded = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
+    policy_loss = -jnp.mean(jnp.minimum(ratio * rows.advantage, bounded * rows.advantage))
+    critic_loss = jnp.mean(jnp.square(_value(critic, rows.obs) - rows.value))
+    clipped = jnp.mean((ratio != bounded).astype(jnp.float32))
+    metrics = {"policy_loss": policy_loss, "critic_loss": critic_loss, "clipped": clipped}
+    return policy_loss + ppo.value_weight * critic_loss, metrics
+
+
+def _value(critic: CriticNetwork, obs: Float[Array, "rows obs"]) -> Float[Array, " rows"]:
+    return critic(obs.T, jnp.zeros((0, obs.shape[0])))

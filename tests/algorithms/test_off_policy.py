@@ -1,0 +1,207 @@
+"""One learner alone: it learns, and its frames, updates and tests are what they say."""
+
+import dataclasses
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compilations import compilations
+from walk import HostWalk, Walk
+
+from credo.algorithms.off_policy import OffPolicy
+from credo.compilation import jit
+from credo.environments.probes import Copy
+from credo.learners.sac import SAC
+from credo.learners.td3 import TD3, ddpg
+from credo.networks.exploration import OrnsteinUhlenbeck
+from credo.networks.mlp import MLP, Critic
+
+FAST = {"actor_lr": 0.01, "critic_lr": 0.01, "tau": 0.05, "gamma": 0.5, "batch_size": 64}
+CRITIC = Critic(hidden=(16,))
+LEARNERS = {
+    "td3": TD3(critic=CRITIC, **FAST),
+    "ddpg": ddpg(critic=CRITIC, noise=OrnsteinUhlenbeck(scale=1.0), **FAST),
+    "sac": SAC(critic=CRITIC, alpha_lr=0.01, target_entropy=-2.0, **FAST),
+}
+SETTINGS = {"episodes": 2, "start_frames": 60, "replay_capacity": 1000, "test_episodes": 20}
+
+
+@jit
+def generation(algorithm, state, key):
+    return algorithm.generation(state, key=key)
+
+
+def run(algorithm, generations, play=generation, seed=0):
+    """Metrics of each generation, and the last state."""
+    root, rows = jax.random.key(seed), []
+    state = algorithm.init(key=jax.random.fold_in(root, 0))
+    for g in range(1, generations + 1):
+        state, metrics = play(algorithm, state, jax.random.fold_in(root, g))
+        rows.append({name: np.asarray(value).item() for name, value in metrics.items()})
+    return rows, state
+
+
+def same(a, b):
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(np.array_equal(x, y) for x, y in pairs)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_it_learns_to_copy(name):
+    """The best return is 0; whoever does nothing earns -10/3."""
+    network = MLP(hidden=(16,), activation="relu", initializer="uniform")
+    algorithm = OffPolicy(Copy(), network, LEARNERS[name], test_every=20, **SETTINGS)
+    rows, _ = run(algorithm, 25)
+    assert sum(row["updates"] for row in rows) == 25 * 20 - 60
+    assert rows[0]["champion_score"] < -0.9
+    assert rows[-1]["champion_score"] > -0.3
+
+
+ALGORITHM = OffPolicy(
+    HostWalk(),
+    MLP(hidden=(3,)),
+    TD3(critic=Critic(hidden=(3,)), actor_lr=0.01, batch_size=4),
+    episodes=2,
+    start_frames=20,
+    updates_per_frame=0.5,
+    test_every=30,
+    test_episodes=2,
+    replay_capacity=100,
+)
+
+
+def eager(algorithm, state, key):
+    return algorithm.generation(state, key=key)
+
+
+@pytest.fixture(scope="module")
+def host():
+    """Rows of metrics and, after each generation, the state but for its replay buffer."""
+    root, rows, states = jax.random.key(0), [], []
+    state = ALGORITHM.init(key=jax.random.fold_in(root, 0))
+    for g in range(1, 13):
+        states.append(eqx.tree_at(lambda s: s.replay, state, None))
+        state, metrics = ALGORITHM.generation(state, key=jax.random.fold_in(root, g))
+        rows.append({name: np.asarray(value).item() for name, value in metrics.items()})
+    return rows, [*states, state]
+
+
+def test_updates_are_the_share_of_all_frames_once_random_actions_are_over(host):
+    rows, states = host
+    frames = np.cumsum([row["frames"] for row in rows])
+    assert len({row["frames"] for row in rows}) > 1
+    before = np.concatenate([[0], frames[:-1]])
+    expected = np.where(frames > 20, frames // 2 - before // 2, 0)
+    assert [row["updates"] for row in rows] == expected.tolist()
+    assert (expected == 0).any()
+    for i, row in enumerate(rows):
+        assert same(states[i].learner, states[i + 1].learner) == (row["updates"] == 0)
+        assert np.isnan(row["critic_loss"]) == (row["updates"] == 0)
+    assert int(states[-1].frames) == frames[-1]
+    assert int(states[-1].replay.written) == frames[-1]
+
+
+def test_tests_come_every_so_many_frames_and_fix_the_champion(host):
+    rows, states = host
+    frames = np.concatenate([[0], np.cumsum([row["frames"] for row in rows])])
+    for i, row in enumerate(rows):
+        due = i == 0 or frames[i + 1] // 30 > frames[i] // 30
+        champion = states[i + 1].champion
+        if due:
+            assert same(champion, ALGORITHM.learner.actor(states[i + 1].learner))
+        else:
+            assert same(champion, states[i].champion)
+            assert row["champion_score"] == rows[i - 1]["champion_score"]
+    assert 2 <= sum(not same(a.champion, b.champion) for a, b in itertools.pairwise(states)) < 12
+
+
+def test_the_score_is_the_actors_without_noise(host):
+    rows, states = host
+    key = jax.random.split(jax.random.fold_in(jax.random.key(0), 1), 3)[2]
+    played = ALGORITHM.test(states[1].champion, key=key)
+    assert played.shape == (1, 2)
+    assert float(jnp.mean(played)) == pytest.approx(rows[0]["champion_score"], rel=1e-6)
+    # Of the task's last signal, which is what is reported.
+    assert rows[0]["champion_score"] <= 0.0
+
+
+def test_first_actions_are_random_and_then_the_actors_with_noise(host):
+    _, states = host
+    data = states[-1].replay.data
+    action = np.asarray(data.action)[: int(states[-1].frames)]
+    assert np.abs(action[:20]).mean() == pytest.approx(0.5, abs=0.2)
+    assert (np.abs(action) <= 1.0).all()
+    assert len(np.unique(action)) > 0.8 * len(action)
+
+
+def test_nothing_compiles_after_the_first_generation_that_learns(host):
+    """In this process the fixture was that."""
+    state, root, seen = ALGORITHM.init(key=jax.random.key(1)), jax.random.key(1), []
+    with compilations() as events:
+        for g in range(10):
+            state, metrics = ALGORITHM.generation(state, key=jax.random.fold_in(root, g))
+            seen.append((int(metrics["frames"]), int(metrics["updates"])))
+    assert events == []
+    assert len({frames for frames, updates in seen if updates}) > 1
+
+
+def test_it_goes_on_from_a_given_policy():
+    state = ALGORITHM.init(key=jax.random.key(0))
+    given = ALGORITHM.network.init(2, 1, key=jax.random.key(9))
+    warm = ALGORITHM.warm(state, given)
+    assert same(warm.champion, given)
+    assert same(ALGORITHM.learner.actor(warm.learner), given)
+
+
+def test_a_host_task_and_the_same_in_jax_start_alike():
+    """Random actions, worlds and bookkeeping are one text for both."""
+    inside = dataclasses.replace(ALGORITHM, env=Walk(), start_frames=1000)
+    outside = dataclasses.replace(inside, env=HostWalk())
+    rows, state = run(inside, 3)
+    other_rows, other = run(outside, 3, play=eager)
+    for a, b in zip(rows, other_rows, strict=True):
+        assert a.keys() == b.keys()
+        for metric, value in a.items():
+            np.testing.assert_allclose(value, b[metric], rtol=1e-4, err_msg=metric)
+    for x, y in zip(jax.tree.leaves(state.replay), jax.tree.leaves(other.replay), strict=True):
+        assert x.dtype == y.dtype
+    # The rows come in another order: step by step, of all lanes or lane after lane.
+    size = int(state.replay.size)
+    a, b = (np.asarray(s.replay.data.obs)[:size] for s in (state, other))
+    np.testing.assert_allclose(np.sort(a, axis=0), np.sort(b, axis=0), rtol=1e-4, atol=1e-6)
+
+
+def test_presets_have_the_constants_of_their_authors():
+    presets = {name: make(Copy()) for name, make in OffPolicy.presets().items()}
+    assert set(presets) == {"td3", "ddpg", "sac"}
+    td3, sac = presets["td3"], presets["sac"]
+    assert isinstance(td3.learner, TD3)
+    assert (td3.start_frames, td3.network.hidden, td3.learner.policy_delay) == (
+        25_000,
+        (256, 256),
+        2,
+    )
+    assert (td3.learner.batch_size, td3.learner.tau, td3.learner.gamma) == (256, 0.005, 0.99)
+    assert presets["ddpg"].network.normalization == "before"
+    assert (presets["ddpg"].start_frames, presets["ddpg"].learner.critics) == (1_000, 1)
+    assert isinstance(sac.learner, SAC)
+    assert (sac.start_frames, sac.learner.target_entropy) == (10_000, -1.0)
+    own = OffPolicy.sac(Copy(), MLP(hidden=(2,)), start_frames=5)
+    assert (own.network, own.start_frames) == (MLP(hidden=(2,)), 5)
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"episodes": 0}, "episodes is 0"),
+        ({"start_frames": -1}, "start_frames is -1"),
+        ({"updates_per_frame": -0.5}, "updates_per_frame is -0.5"),
+        ({"learner": TD3(signal="fun")}, "no reward signal 'fun'.*reward"),
+    ],
+)
+def test_impossible_settings_are_refused(fields, told):
+    with pytest.raises(ValueError, match=told):
+        OffPolicy(Copy(), **fields)

@@ -1,0 +1,117 @@
+"""PPO: advantages and objective by hand, and a task with a known answer."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compilations import compilations
+from walk import HostWalk
+
+from credo.algorithms.ppo import PPO, Actor, Sample, advantages, improve, prepare, surrogate
+from credo.compilation import jit
+from credo.environments.probes import Copy
+from credo.networks.mlp import MLP, Critic
+
+SMALL = {
+    "network": MLP(hidden=(8,), initializer="fan_in", output_scale=0.01),
+    "critic": Critic(hidden=(8,), activation="tanh", initializer="fan_in"),
+    "batch_size": 16,
+    "test_episodes": 5,
+}
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """Copy, learned, with its first and last generation."""
+    ppo = PPO(Copy(), horizon=160, copies=16, learning_rate=3e-3, test_every=100, **SMALL)
+    state, generation = jit(ppo.init)(key=jax.random.key(0)), jit(ppo.generation)
+    history = []
+    for i in range(40):
+        state, metrics = generation(state, key=jax.random.fold_in(jax.random.key(1), i))
+        history.append(metrics)
+    return ppo, state, history
+
+
+def test_advantages_by_hand():
+    delta = jnp.array([1.0, 2.0, 4.0, 8.0])
+    goes_on = jnp.array([True, False, True, False])
+    expected = [1.0 + 0.5 * 2.0, 2.0, 4.0 + 0.5 * 8.0, 8.0]
+    np.testing.assert_allclose(advantages(delta, goes_on, 0.5), expected)
+
+
+def test_the_objective_is_clipped_where_that_makes_it_worse(trained):
+    ppo, state, _ = trained
+    obs, action = jnp.zeros((4, 1)), jnp.array([[0.1], [0.2], [0.3], [0.4]])
+    now = state.actor.log_density(obs, action)
+    ratio = jnp.array([1.5, 0.5, 1.5, 0.5])
+    advantage = jnp.array([1.0, 1.0, -1.0, -1.0])
+    value = state.critic(obs.T, jnp.zeros((0, 4)))
+    rows = Sample(obs, action, now - jnp.log(ratio), advantage, value)
+    loss, metrics = surrogate(ppo, (state.actor, state.critic), rows)
+    # min(r·A, clip(r)·A): 1.2, 0.5, -1.5, -0.8
+    assert float(metrics["policy_loss"]) == pytest.approx(-(1.2 + 0.5 - 1.5 - 0.8) / 4, abs=1e-5)
+    assert float(metrics["critic_loss"]) == pytest.approx(0.0, abs=1e-8)
+    assert float(loss) == pytest.approx(float(metrics["policy_loss"]), abs=1e-6)
+    assert float(metrics["clipped"]) == 1.0
+
+
+def test_the_density_is_that_of_a_gaussian(trained):
+    _, state, _ = trained
+    actor = eqx.tree_at(lambda a: a.log_std, state.actor, jnp.log(jnp.array([0.5])))
+    obs = jnp.array([[0.3]])
+    mean = float(actor.mean(obs[0], ())[0][0])
+    expected = -0.5 * ((0.7 - mean) / 0.5) ** 2 - np.log(0.5) - 0.5 * np.log(2 * np.pi)
+    density = Actor.log_density(actor, obs, jnp.array([[0.7]]))
+    assert float(density[0]) == pytest.approx(expected, rel=1e-4)
+
+
+def test_advantages_stop_at_the_end_of_an_episode_and_bootstrap_at_a_time_limit(trained):
+    ppo, state, _ = trained
+    replay = state.replay
+    n, length = int(replay.size), ppo.env.max_steps
+    assert n == 160
+    sample = jit(prepare)(ppo, state, replay)
+    rows = jax.tree.map(lambda x: np.asarray(x)[:n], replay.data)
+    assert not rows.terminated.any()  # Copy ends by its clock
+
+    def value(obs):
+        return np.asarray(state.critic(jnp.asarray(obs.T), jnp.zeros((0, n))))
+
+    delta = rows.rewards["reward"] + 0.99 * value(rows.next_obs) - value(rows.obs)
+    expected = np.zeros(n)
+    for i in reversed(range(n)):
+        last = i % length == length - 1
+        expected[i] = delta[i] + (0.0 if last else 0.99 * 0.95 * expected[i + 1])
+    np.testing.assert_allclose(sample.value[:n], expected + value(rows.obs), rtol=1e-3, atol=1e-3)
+    normal = (expected - expected.mean()) / expected.std()
+    np.testing.assert_allclose(sample.advantage[:n], normal, rtol=1e-3, atol=2e-3)
+
+
+def test_copy_is_learned(trained):
+    _, _, history = trained
+    first, last = (float(metrics["champion_score"]) for metrics in (history[0], history[-1]))
+    assert first < -2.0  # doing nothing earns -3.3
+    assert last > -0.6
+
+
+def test_no_update_leaves_the_networks_alone(trained):
+    ppo, state, _ = trained
+    actor, *_ = improve(
+        dataclasses.replace(ppo, learning_rate=0.0), state, state.replay, key=jax.random.key(0)
+    )
+    for a, b in zip(jax.tree.leaves(actor), jax.tree.leaves(state.actor), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_on_a_host_task_nothing_compiles_after_the_first_generation():
+    ppo = PPO(HostWalk(spread=0.5), horizon=40, copies=10, test_every=1, **SMALL)
+    state, frames = ppo.init(key=jax.random.key(0)), set()
+    for i in range(5):
+        with compilations() as events:
+            state, metrics = ppo.generation(state, key=jax.random.fold_in(jax.random.key(1), i))
+            frames.add(int(metrics["frames"]))
+        assert i < 2 or events == []
+    assert len(frames) > 1

@@ -1,0 +1,110 @@
+"""Lineage: who made whom, in cases computed by hand."""
+
+import jax.numpy as jnp
+import pytest
+
+from credo.evolution.lineage import (
+    CROSSED,
+    CROSSED_AND_MUTATED,
+    DRAWN,
+    INJECTED,
+    MAKERS,
+    MUTATED,
+    Lineage,
+)
+
+
+def index(*numbers):
+    return jnp.array(numbers, jnp.int32)
+
+
+def flags(*numbers):
+    return jnp.array(numbers, bool)
+
+
+@pytest.fixture
+def guests():
+    """Five members; learner 0's actor lies in slot 4 and learner 1's in slot 3."""
+    return Lineage.first(5, 2).inject(4, 0).inject(3, 1)
+
+
+def test_at_first_everybody_was_drawn():
+    lineage = Lineage.first(3, 2)
+    assert lineage.maker.tolist() == [DRAWN] * 3
+    assert lineage.share.tolist() == [[1.0, 0.0, 0.0]] * 3
+    assert lineage.guest.tolist() == [-1] * 3
+    assert Lineage.first(3, 0).share.tolist() == [[1.0]] * 3
+
+
+def test_an_injected_actor_is_its_learners_and_nobody_elses(guests):
+    assert guests.maker.tolist() == [DRAWN, DRAWN, DRAWN, INJECTED, INJECTED]
+    assert guests.share.tolist() == [[1.0, 0.0, 0.0]] * 3 + [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
+    assert guests.guest.tolist() == [-1, -1, -1, 1, 0]
+
+
+def test_children_in_every_way(guests):
+    next_ = guests.children(
+        elites=index(4),
+        parents=index(4, 3, 0, 0),
+        mates=index(4, 4, 4, 4),
+        crossed=flags(0, 1, 1, 0),
+        mutated=flags(0, 0, 1, 1),
+    )
+    made = [INJECTED, INJECTED, CROSSED, CROSSED_AND_MUTATED, MUTATED]
+    assert next_.maker.tolist() == made
+    assert next_.share.tolist() == [
+        [0.0, 1.0, 0.0],
+        [0.0, 1.0, 0.0],
+        [0.0, 0.5, 0.5],
+        [0.5, 0.5, 0.0],
+        [1.0, 0.0, 0.0],
+    ]
+    assert next_.guest.tolist() == [-1] * 5
+    assert next_.guest.dtype == guests.guest.dtype
+
+
+def test_the_share_of_a_learner_grows_with_each_crossing(guests):
+    """Member 0's line is crossed with an elite, which is learner 0's, three times."""
+    lineage, everyone = guests, jnp.ones(4, bool)
+    lineage = lineage.children(index(4), index(0, 0, 0, 0), index(4, 4, 4, 4), everyone, everyone)
+    for share in (0.75, 0.875):
+        lineage = lineage.children(
+            index(0), index(1, 2, 3, 4), index(0, 0, 0, 0), everyone, ~everyone
+        )
+        assert lineage.share.tolist() == [[0.0, 1.0, 0.0], *[[1.0 - share, share, 0.0]] * 4]
+    assert lineage.maker.tolist() == [INJECTED, *[CROSSED] * 4]
+
+
+def test_a_guest_is_elite_before_it_is_selected(guests):
+    fates = guests.fates(index(4, 0), index(4, 3, 1))
+    assert {name: count.tolist() for name, count in fates.items()} == {
+        "elite": [1, 0],
+        "selected": [0, 1],
+        "discarded": [0, 0],
+    }
+
+
+def test_who_is_neither_elite_nor_parent_is_discarded(guests):
+    fates = guests.fates(index(1, 0), index(1, 1, 4))
+    assert {name: count.tolist() for name, count in fates.items()} == {
+        "elite": [0, 0],
+        "selected": [1, 0],
+        "discarded": [0, 1],
+    }
+
+
+def test_members_that_are_no_guests_do_not_count():
+    fates = Lineage.first(4, 1).fates(index(0), index(1, 2, 3))
+    assert {name: count.tolist() for name, count in fates.items()} == {
+        "elite": [0],
+        "selected": [0],
+        "discarded": [0],
+    }
+
+
+def test_makers_have_names():
+    assert MAKERS[DRAWN] == "drawn"
+    assert MAKERS[MUTATED] == "mutation"
+    assert MAKERS[CROSSED] == "crossover"
+    assert MAKERS[CROSSED_AND_MUTATED] == "crossover and mutation"
+    assert MAKERS[INJECTED] == "learner"

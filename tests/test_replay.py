@@ -1,0 +1,158 @@
+"""Replay: a ring of rows that belong together."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compilations import compilations
+
+from credo import replay
+from credo.replay import Replay
+from credo.types import Transition
+
+CAPACITY = 5
+ROW = Transition(
+    jnp.zeros(2),
+    jnp.zeros(1),
+    {"a": jnp.float32(0.0), "b": jnp.float32(0.0)},
+    jnp.zeros(2),
+    jnp.bool_(False),
+)
+
+
+def rows(numbers):
+    """Rows that say their number in every field."""
+    i = np.asarray(numbers, np.float32)
+    obs = np.stack([i, -i], axis=1)
+    return Transition(obs, 10 * i[:, None], {"a": i, "b": 2 * i}, obs + 0.5, i % 3 == 0)
+
+
+def numbers(transitions):
+    """The numbers of rows, whose fields must agree."""
+    found = np.asarray(transitions.obs)[:, 0]
+    jax.tree.map(np.testing.assert_array_equal, transitions, rows(found))
+    return found.tolist()
+
+
+def held(ring):
+    """What is stored, slot by slot; the rest is as it was at first."""
+    size = int(ring.size)
+    for leaf in jax.tree.leaves(ring.data):
+        assert not np.asarray(leaf[size:]).any()
+    return numbers(jax.tree.map(lambda x: x[:size], ring.data))
+
+
+class Ring:
+    """The same in plain Python."""
+
+    def __init__(self, capacity):
+        self.slots, self.written, self.capacity = {}, 0, capacity
+
+    def extend(self, numbers):
+        for number in numbers:
+            self.slots[self.written % self.capacity] = number
+            self.written += 1
+
+    def held(self):
+        return [self.slots[i] for i in range(len(self.slots))]
+
+
+def test_a_fresh_one_is_empty():
+    ring = Replay.empty(ROW, CAPACITY)
+    assert (ring.capacity, int(ring.position), int(ring.size)) == (CAPACITY, 0, 0)
+    assert ring.data.obs.shape == (CAPACITY, 2)
+    assert ring.data.rewards["b"].shape == (CAPACITY,)
+    assert ring.data.terminated.dtype == jnp.bool_
+
+
+def test_valid_rows_follow_in_order_and_the_oldest_is_overwritten():
+    ring, by_hand = Replay.empty(ROW, CAPACITY), Ring(CAPACITY)
+    masks = [[1, 0, 1, 1], [0, 0, 0, 0], [0, 1, 0, 0], [1, 1, 1, 1], [0, 1, 1, 0], [1, 0, 0, 1]]
+    for turn, mask in enumerate(np.array(masks, bool)):
+        new = 4 * turn + np.arange(1, 5)
+        ring = replay.extend(ring, jax.tree.map(jnp.asarray, rows(new)), jnp.asarray(mask))
+        by_hand.extend(new[mask].tolist())
+        assert held(ring) == by_hand.held()
+        assert int(ring.position) == by_hand.written % CAPACITY
+        assert int(ring.size) == min(by_hand.written, CAPACITY)
+    assert by_hand.written == 12  # it went round twice
+
+
+@pytest.mark.parametrize("before", [0, 3])
+def test_of_more_rows_than_capacity_the_last_ones_stay(before):
+    ring, by_hand = Replay.empty(ROW, CAPACITY), Ring(CAPACITY)
+    first, new = np.arange(1, 4), np.arange(10, 22)
+    valid = new % 4 > 0  # 9 of 12
+    for some, mask in ((first, np.arange(3) < before), (new, valid)):
+        ring = replay.extend(ring, rows(some), jnp.asarray(mask))
+        by_hand.extend(some[mask].tolist())
+    assert held(ring) == by_hand.held()
+    assert set(held(ring)) == {15, 17, 18, 19, 21}
+    assert int(ring.written) == before + 9
+
+
+@pytest.mark.parametrize("sizes", [(1,), (4,), (3, 5), (11,), (0, 2), (9, 9)])
+def test_rows_from_the_host_come_in_blocks(monkeypatch, sizes):
+    monkeypatch.setattr(replay, "BLOCK", 4)
+    ring, by_hand, last = Replay.empty(ROW, 7), Ring(7), 0
+    for size in sizes:
+        new = np.arange(last + 1, last + size + 1)
+        ring, last = replay.extend(ring, rows(new)), last + size
+        by_hand.extend(new.tolist())
+    assert held(ring) == by_hand.held()
+    assert int(ring.written) == sum(sizes)
+
+
+def test_the_number_of_rows_is_data_and_the_old_buffer_is_gone():
+    ring = replay.extend(Replay.empty(ROW, 3000), rows(np.arange(1, 6)))
+    on_device, valid = jax.tree.map(jnp.asarray, rows(np.arange(1, 9))), np.arange(8)
+    ring = replay.extend(ring, on_device, jnp.asarray(valid < 8))
+    masks = [jnp.asarray(valid < n) for n in (1, 5)]
+    with compilations() as events:
+        jax.jit(lambda x: x + 3.25)(np.float32(1.0))
+    assert events  # the count sees a compilation
+    old = ring
+    with compilations() as events:
+        for n in (1, 700, 1024, 1025, 2500):
+            ring = replay.extend(ring, rows(np.ones(n)))
+        for mask in masks:
+            ring = replay.extend(ring, on_device, mask)
+        jax.block_until_ready(ring)
+    assert events == []
+    assert int(ring.written) == 5 + 8 + 1 + 700 + 1024 + 1025 + 2500 + 1 + 5
+    assert all(leaf.is_deleted() for leaf in jax.tree.leaves(old))
+
+
+@pytest.mark.parametrize("written", [3, 12])
+def test_samples_are_uniform_over_the_filled_rows(written):
+    ring = replay.extend(Replay.empty(ROW, CAPACITY), rows(np.arange(1, written + 1)))
+    n = 6000
+    drawn = numbers(jax.jit(lambda key: ring.sample(n, key=key))(jax.random.key(0)))
+    filled = held(ring)
+    assert len(filled) == min(written, CAPACITY)
+    found, counts = np.unique(drawn, return_counts=True)
+    assert found.tolist() == sorted(filled)
+    expected = n / len(filled)
+    # The 0.999 quantile of chi-squared with at most 4 degrees of freedom.
+    assert np.sum((counts - expected) ** 2 / expected) < 18.5
+    again = numbers(ring.sample(20, key=jax.random.key(1)))
+    assert again != drawn[:20]
+    assert len(set(again)) < 20  # with replacement
+
+
+def test_too_little_memory_is_told_with_both_numbers(monkeypatch):
+    assert replay.row_bytes(ROW) == 8 + 4 + 4 + 4 + 8 + 1
+    monkeypatch.setattr(replay, "_memory", lambda: 2.9e9)
+    with pytest.raises(ValueError, match=r"200,000,000.*5\.8 GB.*2\.9 GB.*at most 100,000,000"):
+        Replay.empty(ROW, 200_000_000)
+    monkeypatch.setattr(replay, "_memory", lambda: 29.0 * CAPACITY)
+    assert Replay.empty(ROW, CAPACITY).capacity == CAPACITY
+    with pytest.raises(ValueError, match="at most 5"):
+        Replay.empty(ROW, CAPACITY + 1)
+    with pytest.raises(ValueError, match="capacity is 0"):
+        Replay.empty(ROW, 0)
+
+
+def test_this_machine_says_its_memory():
+    with pytest.raises(ValueError, match="give a smaller capacity"):
+        Replay.empty(ROW, 10**15)
