@@ -82,6 +82,19 @@ EXPERIMENTS = {
     "fig-3.9a": "success by depth, sequence recall",
     "fig-3.10": "recall in corridors of 1..101 steps",
     "ablation-3.4a": "our settings less one ingredient, 21-deep",
+    "check-td3": "TD3 alone, against its authors",
+    "fig-5.2": "standard and hard inverted double pendulum",
+    "fig-5.3": "ERL against its parts on six tasks",
+    "fig-5.4": "ERL without selection",
+    "table-5.2": "fate of the learner's actors",
+    "note-5.5": "time of ERL over that of DDPG",
+    "beyond-5": "who made the champions of ERL",
+    "fig-6.2": "CERL with two learners that fail alone",
+    "fig-6.3": "CERL and its parts on Humanoid",
+    "fig-6.4": "exploration of the resource manager",
+    "fig-6.5": "CERL against its parts on four tasks",
+    "table-6.1": "workers of each learner",
+    "beyond-6": "SAC beside TD3, and three managers",
 }
 PRESETS = {
     "as-written": "Algorithm 2 as printed (the default)",
@@ -381,8 +394,9 @@ def _export(argv: list[str]) -> None:
 class ReproduceOptions:
     """Rerun an experiment. What has been run already is not run again."""
 
-    budget: str = "quick"  # smoke (seconds), quick (minutes) or full (as published)
+    budget: str = "quick"  # smoke (seconds), quick (minutes), full; some: million, published
     runs: int | None = None  # independent runs per cell; None: what the budget says
+    only: str | None = None  # cells whose name has this regular expression
     jobs: int | None = None  # processes; None: one per core
     output: str = "reproduced"  # folder for the page and its data
     work: str = "runs/reproduce"  # folder for the runs behind them
@@ -393,8 +407,9 @@ def _reproduce(argv: list[str]) -> None:
     if name not in EXPERIMENTS:
         fail(f"no experiment {name!r}", name, EXPERIMENTS)
     (options,) = parse(f"credo reproduce {name}", None, ReproduceOptions, argv)
-    if options.budget not in ("smoke", "quick", "full"):
-        fail(f"no budget {options.budget!r}", options.budget, ("smoke", "quick", "full"))
+    budgets = ("smoke", "quick", "full", "million", "published")
+    if options.budget not in budgets:
+        fail(f"no budget {options.budget!r}", options.budget, budgets)
 
     def go() -> None:
         from .experiments import base
@@ -403,6 +418,7 @@ def _reproduce(argv: list[str]) -> None:
             name,
             options.budget,
             runs=options.runs,
+            only=options.only,
             jobs=options.jobs,
             output=pathlib.Path(options.output),
             work=pathlib.Path(options.work),

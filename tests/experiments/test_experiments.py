@@ -16,9 +16,11 @@ from credo.environments.sequence_recall import SequenceRecall
 from credo.experiments import base, chapter3, fig_3_4a
 from credo.networks.mmu import MMU
 from credo.runs import executor, page
-from credo.runs.loop import Run, train
+from credo.runs.loop import Run, RunError, train
 
-BUDGETS = ("smoke", "quick", "full")
+BUDGETS = base.BUDGETS
+CHAPTER3 = [name for name in base.MODULES if name.partition("-")[2].startswith("3.")]
+RESULTS = pathlib.Path(base.__file__).parents[3] / "results"
 SIZES = {"population_size": 10, "episodes": 4, "test_episodes": 6}
 SEEDS, GENERATIONS = 2, 12
 TINY = {
@@ -71,13 +73,13 @@ def cells_of(name: str, runs: dict[str, list[Run]]) -> dict[str, list[Run]]:
 
 def test_the_command_line_lists_what_there_is():
     assert list(cli.EXPERIMENTS) == list(base.MODULES)
-    folder = pathlib.Path(base.__file__).parent
-    modules = {path.stem for path in folder.glob("*_[0-9]*.py")}
-    assert modules == set(base.MODULES.values())
+    modules = {path.stem for path in pathlib.Path(base.__file__).parent.glob("*.py")}
+    shared = {"__init__", "base", "chapter3", "chapter5", "chapter6"}
+    assert modules - shared == set(base.MODULES.values())
 
 
 @pytest.mark.parametrize("budget", BUDGETS)
-@pytest.mark.parametrize("name", base.MODULES)
+@pytest.mark.parametrize("name", CHAPTER3)
 def test_cells_are_named_once_and_have_runs(name, budget):
     cells = experiment(name).cells(budget)
     assert len(cells) >= 1
@@ -90,16 +92,56 @@ def test_cells_are_named_once_and_have_runs(name, budget):
         assert pathlib.Path(cell.name).name == cell.name  # it is the name of a folder
 
 
-@pytest.mark.parametrize("budget", BUDGETS)
+@pytest.mark.parametrize("budget", [*BUDGETS, "million", "published"])
 def test_cells_of_one_name_are_the_same_in_every_experiment(budget):
     """They share their runs."""
     seen = {}
     for name in base.MODULES:
-        for cell in experiment(name).cells(budget):
-            kept = seen.setdefault(cell.name, cell)
-            assert kept.algorithm == cell.algorithm
-            assert (kept.generations, kept.runs) == (cell.generations, cell.runs)
+        if budget in base.budgets(name):
+            for cell in experiment(name).cells(budget):
+                kept = seen.setdefault(cell.name, cell)
+                assert kept.algorithm == cell.algorithm
+                assert (kept.runs, base.limits(kept)) == (cell.runs, base.limits(cell))
     assert len(seen) > 3
+
+
+def test_a_budget_that_an_experiment_lacks_is_named(tmp_path):
+    with pytest.raises(RunError, match="no budget 'million': it has smoke, quick, full"):
+        base.reproduce("fig-3.4a", "million", output=tmp_path, work=tmp_path)
+
+
+def test_some_cells_alone(tmp_path, monkeypatch):
+    chosen = []
+    monkeypatch.setattr(executor, "run", lambda jobs, *_, **__: chosen.extend(jobs))
+    monkeypatch.setattr(base, "Run", lambda path: path)
+    monkeypatch.setattr(fig_3_4a, "measure", lambda runs, budget: {})
+    monkeypatch.setattr(fig_3_4a, "sections", lambda measured: [])
+    folders = {"output": tmp_path / "pages", "work": tmp_path / "work"}
+    html = base.reproduce("fig-3.4a", "quick", only="5-deep (ours|as coded)$", **folders)
+    assert {job.path.parent.name for job in chosen} == {
+        "classification 5-deep ours",
+        "classification 5-deep as coded",
+    }
+    record = json.loads(html.with_name("results.json").read_text())
+    assert record["command"].endswith("--budget quick --only '5-deep (ours|as coded)$'")
+    with pytest.raises(RunError, match=r"no cell of .* has 'hopper' in its name"):
+        base.reproduce("fig-3.4a", "quick", only="hopper", **folders)
+
+
+def test_committed_results_still_make_their_pages(tmp_path):
+    """Their record of a cell is older than budgets in frames."""
+    for folder in sorted(RESULTS.glob("*/*/results.json")):
+        record = json.loads(folder.read_text())
+        assert all(base.extent(cell) for cell in record["cells"].values())
+    old = tmp_path / "results.json"
+    old.write_text((RESULTS / "table-3.2" / "full" / "results.json").read_text())
+    assert "10 × 1000 generations" in base.page(old).read_text()
+
+
+def test_extent_says_what_ends_a_run():
+    assert base.extent({"generations": 1000}) == "1000 generations"
+    both = {"generations": 910, "frames": 1_500_000, "stop_at": 9000.0}
+    assert base.extent(both) == "1,500,000 frames or 910 generations or a score of 9,000"
 
 
 def numbers(value):
@@ -111,7 +153,7 @@ def numbers(value):
         yield value
 
 
-@pytest.mark.parametrize("name", base.MODULES)
+@pytest.mark.parametrize("name", CHAPTER3)
 def test_its_numbers_are_plain_and_its_page_renders(name, runs):
     module = experiment(name)
     chosen = cells_of(name, runs)

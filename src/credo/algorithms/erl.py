@@ -303,11 +303,12 @@ def breed(
 ) -> tuple[PyTree, Lineage, AbstractPolicy, Metrics]:
     """The next population with its lineage, elites first; the champion; where it came from and
     what became of the learners' actors."""
-    select_key, mate_key, chance_key, cross_key, mutate_key = jax.random.split(key, 5)
-    n = erl.population_size - erl.elites
+    order_key, select_key, mate_key, chance_key, cross_key, mutate_key = jax.random.split(key, 6)
+    k, n = erl.population_size, erl.population_size - erl.elites
 
-    # 8-9: Rank the population; select the first e as elites.
-    order = ranking(fitness)
+    # 8-9: Rank the population; select the first e as elites. Without selection all are equal.
+    blind = jax.random.permutation(order_key, k)
+    order = ranking(fitness) if erl.selection.sees_fitness else blind
     elites = order[: erl.elites]
     # 10: Select (k - e) actors, to form set S; the offspring of better parents come first.
     parents = erl.selection(fitness, n, key=select_key)
@@ -327,7 +328,7 @@ def breed(
     )
     mutated = eqx.filter_vmap(differ)(mutants, offspring)
 
-    champion = order[0]
+    champion = ranking(fitness)[0]
     metrics = {"champion_maker": lineage.maker[champion]}
     fates = lineage.fates(elites, parents)
     for i in range(len(erl.learners)):

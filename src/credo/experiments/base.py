@@ -1,14 +1,17 @@
 """What every experiment shares: cells of runs, budgets, the folder of results."""
 
+import dataclasses
 import importlib
 import json
 import pathlib
+import re
+import shlex
 from typing import Any, Protocol
 
 import equinox as eqx
 
 from ..runs import config, executor
-from ..runs.loop import Run
+from ..runs.loop import Run, RunError
 from ..runs.page import Page, write
 
 MODULES = {
@@ -23,7 +26,21 @@ MODULES = {
     "fig-3.9a": "fig_3_9a",
     "fig-3.10": "fig_3_10",
     "ablation-3.4a": "ablation_3_4a",
+    "check-td3": "check_td3",
+    "fig-5.2": "fig_5_2",
+    "fig-5.3": "fig_5_3",
+    "fig-5.4": "fig_5_4",
+    "table-5.2": "table_5_2",
+    "note-5.5": "note_5_5",
+    "beyond-5": "beyond_5",
+    "fig-6.2": "fig_6_2",
+    "fig-6.3": "fig_6_3",
+    "fig-6.4": "fig_6_4",
+    "fig-6.5": "fig_6_5",
+    "table-6.1": "table_6_1",
+    "beyond-6": "beyond_6",
 }
+BUDGETS = ("smoke", "quick", "full")  # a module may define more, as a name of the same
 
 
 class Cell(eqx.Module):
@@ -31,9 +48,11 @@ class Cell(eqx.Module):
 
     name: str  # also the folder of its runs: experiments that share a cell share its runs
     algorithm: Any
-    generations: int
+    generations: int | None  # budget of each run; None: frames alone limit it
     runs: int
     first_seed: int = 0  # settings chosen by looking at some seeds are reported on others
+    frames: int | None = None  # budget of each run, in environment steps
+    stop_at: float | None = None  # a run ends early once its champion's score reaches this
 
 
 class Experiment(Protocol):
@@ -43,7 +62,8 @@ class Experiment(Protocol):
     PUBLISHED: str  # where the dissertation has it
 
     def cells(self, budget: str) -> list[Cell]:
-        """The runs it needs. `budget`: smoke (seconds), quick (minutes) or full."""
+        """The runs it needs. `budget`: smoke (seconds), quick (minutes), full, or one of its own
+        `BUDGETS`."""
         ...
 
     def measure(self, runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
@@ -60,25 +80,35 @@ def reproduce(
     budget: str,
     *,
     runs: int | None = None,
+    only: str | None = None,
     jobs: int | None = None,
     output: pathlib.Path = pathlib.Path("reproduced"),
     work: pathlib.Path = pathlib.Path("runs/reproduce"),
 ) -> pathlib.Path:
     """Run what is missing, measure, and write `results.json` and `report.html`.
 
-    **Returns:** the path of the page.
+    **Arguments:** `runs`: of each cell, instead of what the budget says. `only`: leave out cells in
+    whose name this regular expression is not found: "Hopper", "(erl|ddpg) Hopper".
+
+    **Returns:** the path of the page. **Raises:** `RunError` if there is no such budget or cell.
     """
     module: Any = importlib.import_module(f".{MODULES[name]}", __package__)
+    if budget not in (known := budgets(name)):
+        raise RunError(f"{name} has no budget {budget!r}: it has {', '.join(known)}")
     cells = [
-        cell if runs is None else eqx.tree_at(lambda c: c.runs, cell, runs)
+        cell if runs is None else dataclasses.replace(cell, runs=runs)
         for cell in module.cells(budget)
+        if re.search(only or "", cell.name)
     ]
+    if not cells:
+        names = "; ".join(cell.name for cell in module.cells(budget))
+        raise RunError(f"no cell of {name} has {only!r} in its name: there are {names}")
     folder = {
         cell.name: [work / budget / cell.name / str(s) for s in seeds(cell)] for cell in cells
     }
     executor.run(
         [
-            executor.Job(path, cell.algorithm, cell.generations, seed)
+            executor.Job(path, cell.algorithm, seed=seed, **limits(cell))
             for cell in cells
             for seed, path in zip(seeds(cell), folder[cell.name], strict=True)
         ],
@@ -90,12 +120,13 @@ def reproduce(
         "experiment": name,
         "budget": budget,
         "command": f"credo reproduce {name} --budget {budget}"
-        + (f" --runs {runs}" if runs is not None else ""),
+        + (f" --runs {runs}" if runs is not None else "")
+        + (f" --only {shlex.quote(only)}" if only is not None else ""),
         "cells": {
             cell.name: {
                 "runs": cell.runs,
                 "first seed": cell.first_seed,
-                "generations": cell.generations,
+                **{name: limit for name, limit in limits(cell).items() if limit is not None},
                 "algorithm": config.to_tree(cell.algorithm),
             }
             for cell in cells
@@ -107,6 +138,17 @@ def reproduce(
     target.mkdir(parents=True, exist_ok=True)
     (target / "results.json").write_text(_compact(results))
     return page(target / "results.json")
+
+
+def budgets(name: str) -> tuple[str, ...]:
+    """The budgets that an experiment can be run at."""
+    module: Any = importlib.import_module(f".{MODULES[name]}", __package__)
+    return getattr(module, "BUDGETS", BUDGETS)
+
+
+def limits(cell: Cell) -> dict[str, Any]:
+    """What ends a run of this cell, by the names that a `Job` has for it."""
+    return {"generations": cell.generations, "frames": cell.frames, "stop_at": cell.stop_at}
 
 
 def seeds(cell: Cell) -> range:
@@ -121,8 +163,7 @@ def page(results: pathlib.Path) -> pathlib.Path:
     facts = {
         "budget": record["budget"],
         "runs": ", ".join(
-            f"{name}: {cell['runs']} × {cell['generations']} generations"
-            for name, cell in record["cells"].items()
+            f"{name}: {cell['runs']} × {extent(cell)}" for name, cell in record["cells"].items()
         ),
         "machine": f"{machine['processor']}, {machine['device']}, {machine['system']}",
         "versions": ", ".join(f"{k} {v}" for k, v in machine["versions"].items()),
@@ -139,6 +180,17 @@ def page(results: pathlib.Path) -> pathlib.Path:
         target,
     )
     return target
+
+
+def extent(cell: dict[str, Any]) -> str:
+    """The budget of a run, in words; `cell` as recorded in a `results.json`."""
+    words = [
+        f"{cell[name]:,} {name}" if name == "frames" else f"{cell[name]} {name}"
+        for name in ("frames", "generations")
+        if cell.get(name) is not None
+    ]
+    early = [f"a score of {cell['stop_at']:,.0f}"] if cell.get("stop_at") is not None else []
+    return " or ".join(words + early)
 
 
 def _compact(results: dict[str, Any]) -> str:

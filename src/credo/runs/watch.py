@@ -209,7 +209,7 @@ def _write_gif(path: pathlib.Path, pictures: Iterator[np.ndarray], rate: float) 
 
 
 def _write_mp4(path: pathlib.Path, pictures: Iterator[np.ndarray], rate: float) -> None:
-    import imageio_ffmpeg
+    import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
 
     # Started here: that package would fork, which a process with JAX in it must not.
     first = next(pictures)

@@ -1,0 +1,134 @@
+"""Figure 5.2: the double pendulum, and the same paid only at the end of an episode."""
+
+from typing import Any
+
+import numpy as np
+
+from ..algorithms.erl import ERL
+from ..algorithms.off_policy import OffPolicy
+from ..runs.loop import Run
+from ..runs.page import Reference, Table
+from . import chapter5
+from .base import Cell
+from .chapter5 import Plan
+
+TITLE = "standard and hard inverted double pendulum"
+PUBLISHED = (
+    "Figure 5.2 of the dissertation: ERL and DDPG solve the standard task in fewer than 3,000 "
+    "episodes and EA in about 22,000; of the hard one, which pays the whole return at the last "
+    "step, ERL needs about 10,000 episodes, EA 22,000, and DDPG fails."
+)
+BUDGETS = ("smoke", "quick", "full", "published")
+TASK, SOLVED = "InvertedDoublePendulum-v5", 9000.0  # mean return of the champion's test
+ALGORITHMS = {"erl": ERL.erl, "ddpg": OffPolicy.ddpg, "ea": ERL.ea}
+# An episode is a few steps long until the task is nearly solved: episodes end most runs, frames
+# those that hold the pendulum up for long and never quite solve the task.
+LIMITS = {  # (frames, generations); of 11, 1 and 10 episodes
+    "smoke": {"erl": (600, 10), "ddpg": (600, 100), "ea": (600, 10)},
+    "quick": {"erl": (60_000, 200), "ddpg": (60_000, 2_000), "ea": (200_000, 500)},
+    "full": {"erl": (1_500_000, 910), "ddpg": (1_500_000, 10_000), "ea": (5_000_000, 2_500)},
+}
+RUNS = {"smoke": 2, "quick": 2, "full": 3, "published": 5}
+GIVEN = {
+    "erl": "< 3,000",
+    "ddpg": "< 3,000",
+    "ea": "~22,000",
+    "erl delayed": "~10,000",
+    "ddpg delayed": "fails",
+    "ea delayed": "~22,000",
+}
+
+
+def cells(budget: str) -> list[Cell]:
+    limits = LIMITS.get(budget, LIMITS["full"])
+    return [
+        chapter5.cell(
+            label,
+            build,
+            TASK,
+            budget,
+            delayed=delayed,
+            planned=Plan(limits[label][0], RUNS[budget]),
+            generations=limits[label][1],
+            stop_at=SOLVED,
+            test_episodes=10,
+        )
+        for delayed in (False, True)
+        for label, build in ALGORITHMS.items()
+    ]
+
+
+def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
+    measured = {}
+    for name, cell in runs.items():
+        found = chapter5.outcome(name, cell, axis="episodes")
+        found["solved after"] = [_solved(run) for run in cell]
+        found["episodes played"] = [int(_episodes(run)[-1]) for run in cell]
+        measured[name] = found
+    return measured
+
+
+def _episodes(run: Run) -> np.ndarray:
+    return chapter5.over(run, run.metrics, "episodes")
+
+
+def _solved(run: Run) -> int | None:
+    """Episodes played when a champion's test first reached `SOLVED`."""
+    reached = np.flatnonzero(run.metrics["champion_score"] >= SOLVED)
+    return int(_episodes(run)[reached[0]]) if reached.size else None
+
+
+def sections(measured: dict[str, Any]) -> list[Any]:
+    variants = {
+        "Standard task": [cell for name, cell in measured.items() if not name.endswith("delayed")],
+        "Hard task, paid at the last step": [
+            cell for name, cell in measured.items() if name.endswith("delayed")
+        ],
+    }
+    level = Reference("solved", SOLVED)
+    return [
+        *(
+            chapter5.curves(title, cells, level, axis="episodes")
+            for title, cells in variants.items()
+            if cells
+        ),
+        solved(measured),
+        chapter5.scores(measured, reference={}),
+        chapter5.about(
+            measured,
+            "Episodes count those of the whole population and of its learner. A run ends when the "
+            f"mean return of its champion's test reaches {SOLVED:,.0f} (5 episodes, DDPG 10), or "
+            "at its limit. DDPG is tested every 5,000 frames only, EA and ERL every generation.",
+        ),
+    ]
+
+
+def solved(measured: dict[str, Any]) -> Table:
+    rows = []
+    for cell in measured.values():
+        after = [
+            f"{n:,}" if n is not None else f"not in {played:,}"
+            for n, played in zip(cell["solved after"], cell["episodes played"], strict=True)
+        ]
+        count = sum(n is not None for n in cell["solved after"])
+        good = sum(np.mean(np.array(run, np.float64)) >= SOLVED for run in cell["final"])
+        rows.append(
+            [
+                cell["label"],
+                GIVEN[cell["label"]],
+                f"{count} of {len(after)}",
+                ", ".join(after),
+                f"{good} of {len(after)}",
+            ]
+        )
+    return Table(
+        "Episodes until the task was solved",
+        [
+            "algorithm",
+            "published",
+            "runs that solved it",
+            "after episodes, each run",
+            f"final champion has {SOLVED:,.0f} in {chapter5.EPISODES} fresh episodes",
+        ],
+        rows,
+    )

@@ -1,0 +1,52 @@
+"""Figure 5.3: ERL, EA and DDPG on six tasks."""
+
+from typing import Any
+
+from ..runs.loop import Run
+from . import chapter5
+from .base import Cell
+
+TITLE = "ERL against its parts on six tasks"
+PUBLISHED = (
+    "Figure 5.3 of the dissertation (curves without numbers): ERL beats DDPG on all six tasks, EA "
+    "on all but Swimmer, where they are equal, and PPO on four of six."
+)
+BUDGETS = chapter5.BUDGETS
+SWIMMER = (
+    "That only evolution solves Swimmer is a matter of the discount: at 0.99 a stroke pays too "
+    "late. The row with gamma 0.9999 shows what a learner alone does with a longer view (published "
+    "elsewhere: 359 at 1M frames)."
+)
+
+
+def cells(budget: str) -> list[Cell]:
+    found = [
+        chapter5.cell(label, build, task, budget)
+        for task in chapter5.tasks(budget)
+        for label, build in chapter5.ALGORITHMS.items()
+    ]
+    if "Swimmer-v5" in chapter5.tasks(budget):
+        found.append(chapter5.td3_gamma("Swimmer-v5", budget, 0.9999))
+    return found
+
+
+def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
+    return {name: chapter5.outcome(name, cell) for name, cell in runs.items()}
+
+
+def sections(measured: dict[str, Any]) -> list[Any]:
+    labels = {cell["label"] for cell in measured.values()}
+    missing = [] if "ppo" in labels else ["PPO is missing here."]
+    swimmer = [SWIMMER] if "Swimmer-v5" in chapter5.tasks_in(measured) else []
+    return [
+        *chapter5.by_task(measured),
+        chapter5.scores(measured),
+        chapter5.about(
+            measured,
+            "DDPG has the learner of ERL, alone, with the same networks, batch and updates per "
+            "frame; EA is the evolution of ERL, alone. The dissertation's DDPG and PPO were those "
+            "of OpenAI Baselines.",
+            *missing,
+            *swimmer,
+        ),
+    ]
