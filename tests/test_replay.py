@@ -17,6 +17,7 @@ ROW = Transition(
     {"a": jnp.float32(0.0), "b": jnp.float32(0.0)},
     jnp.zeros(2),
     jnp.bool_(False),
+    jnp.bool_(False),
 )
 
 
@@ -24,7 +25,7 @@ def rows(numbers):
     """Rows that say their number in every field."""
     i = np.asarray(numbers, np.float32)
     obs = np.stack([i, -i], axis=1)
-    return Transition(obs, 10 * i[:, None], {"a": i, "b": 2 * i}, obs + 0.5, i % 3 == 0)
+    return Transition(obs, 10 * i[:, None], {"a": i, "b": 2 * i}, obs + 0.5, i % 3 == 0, i % 5 == 0)
 
 
 def numbers(transitions):
@@ -141,11 +142,11 @@ def test_samples_are_uniform_over_the_filled_rows(written):
 
 
 def test_too_little_memory_is_told_with_both_numbers(monkeypatch):
-    assert replay.row_bytes(ROW) == 8 + 4 + 4 + 4 + 8 + 1
-    monkeypatch.setattr(replay, "_memory", lambda: 2.9e9)
-    with pytest.raises(ValueError, match=r"200,000,000.*5\.8 GB.*2\.9 GB.*at most 100,000,000"):
+    assert replay.row_bytes(ROW) == 8 + 4 + 4 + 4 + 8 + 1 + 1
+    monkeypatch.setattr(replay, "_memory", lambda: 3.0e9)
+    with pytest.raises(ValueError, match=r"200,000,000.*6\.0 GB.*3\.0 GB.*at most 100,000,000"):
         Replay.empty(ROW, 200_000_000)
-    monkeypatch.setattr(replay, "_memory", lambda: 29.0 * CAPACITY)
+    monkeypatch.setattr(replay, "_memory", lambda: 30.0 * CAPACITY)
     assert Replay.empty(ROW, CAPACITY).capacity == CAPACITY
     with pytest.raises(ValueError, match="at most 5"):
         Replay.empty(ROW, CAPACITY + 1)

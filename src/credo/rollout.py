@@ -52,7 +52,8 @@ def collect(
     common: bool = True,
     key: PRNGKeyArray,
 ) -> tuple[Evaluation, Experience]:
-    """`evaluate`, and every transition that was met. A finished episode costs nothing more.
+    """`evaluate`, and every transition that was met. Outside JAX a finished episode costs no more
+    physics; in JAX all lanes step until the last one ends.
 
     **Arguments:** of its `episodes` each member plays the first `wanted`; that number is data.
     The others have no steps and a return of 0.
@@ -68,12 +69,14 @@ def blank(env: Environment) -> Transition:
     if isinstance(env, AbstractHostEnvironment):
         obs = jnp.zeros(env.obs_size)
         rewards = {name: jnp.float32(0.0) for name in env.signals}
-        return Transition(obs, jnp.zeros(env.action_size), rewards, obs, jnp.bool_(False))
+        ended = jnp.bool_(False)
+        return Transition(obs, jnp.zeros(env.action_size), rewards, obs, ended, ended)
     _, first = jax.eval_shape(lambda: env.reset(key=jax.random.key(0)))
     team = () if env.agents is None else (env.agents,)
     first = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), first)
     action = jnp.zeros((*team, env.action_size))
-    return Transition(first.obs, action, first.rewards, first.obs, first.terminated)
+    ends = (first.terminated, first.truncated)
+    return Transition(first.obs, action, first.rewards, first.obs, *ends)
 
 
 def world_keys(pop: int, episodes: int, common: bool, *, key: PRNGKeyArray) -> PRNGKeyArray:
@@ -170,13 +173,14 @@ def _collect(
     def advance(loop):
         t, states, obs, carries, active, lost, buffer, valid = loop
         actions, carries = _act(population, obs, carries)
-        nan = jnp.isnan(actions)
+        nan = ~jnp.isfinite(actions)
         lost = lost | (active & jnp.any(nan.reshape(*lost.shape, -1), axis=2))
         actions = jnp.where(nan, 0.0, actions)
         keys = _each(lambda key: jax.random.fold_in(key, t))(step_keys)
         bounded = jnp.clip(actions, -1.0, 1.0)
         states, step = _each(lambda s, a, key: env.step(s, a, key=key))(states, bounded, keys)
-        row = Transition(obs, actions, step.rewards, step.obs, step.terminated)
+        ends = (step.terminated, step.truncated)
+        row = Transition(obs, actions, step.rewards, step.obs, *ends)
         buffer = jax.tree.map(lambda xs, x: xs.at[t].set(x), buffer, row)
         valid = valid.at[t].set(active)
         active = active & ~(step.terminated | step.truncated)
@@ -216,16 +220,18 @@ def _collect_on_host(
     seeds, carry = start(arrays, (pop, episodes), common, key)
     copies = env.copies(pop * episodes)
     active = np.tile(np.arange(episodes) < int(wanted), pop)
-    lost = np.zeros_like(active)  # the policy said NaN: it goes on with 0 and its return is NaN
+    lost = np.zeros_like(
+        active
+    )  # the policy said NaN or infinity: it goes on with 0 and its return is NaN
     obs = copies.reset(np.asarray(seeds).reshape(-1), active)
     rows, played = [], []
     for _ in range(env.max_steps):
         action, carry = act(arrays, obs, carry)
         action = np.asarray(action)
-        nan = np.isnan(action)
+        nan = ~np.isfinite(action)
         lost, action = lost | (active & nan.any(axis=1)), np.where(nan, np.float32(0.0), action)
         step = copies.step(action, active)
-        rows.append((obs, action, step.rewards, step.obs, step.terminated))
+        rows.append((obs, action, step.rewards, step.obs, step.terminated, step.truncated))
         played.append(active)
         active = active & ~(step.terminated | step.truncated)
         obs = step.obs

@@ -47,7 +47,8 @@ class Transition(eqx.Module):
     action: Float[Array, "*rows act"]
     rewards: dict[str, Float[Array, "*rows"]]
     next_obs: Float[Array, "*rows obs"]
-    terminated: Bool[Array, "*rows"]  # the task ended; after a time limit it did not
+    terminated: Bool[Array, "*rows"]  # the task ended
+    truncated: Bool[Array, "*rows"]  # the clock ran out
 
 
 class Batch(eqx.Module):
@@ -58,3 +59,4 @@ class Batch(eqx.Module):
     reward: Float[Array, " batch"]
     next_obs: Float[Array, "batch obs"]
     terminated: Bool[Array, " batch"]
+    truncated: Bool[Array, " batch"]

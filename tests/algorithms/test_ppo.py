@@ -73,7 +73,7 @@ def test_advantages_stop_at_the_end_of_an_episode_and_bootstrap_at_a_time_limit(
     replay = state.replay
     n, length = int(replay.size), ppo.env.max_steps
     assert n == 160
-    sample = jit(prepare)(ppo, state, replay)
+    sample = jit(prepare)(ppo, (state.actor, state.critic), replay)
     rows = jax.tree.map(lambda x: np.asarray(x)[:n], replay.data)
     assert not rows.terminated.any()  # Copy ends by its clock
 
@@ -99,9 +99,9 @@ def test_copy_is_learned(trained):
 
 def test_no_update_leaves_the_networks_alone(trained):
     ppo, state, _ = trained
-    actor, *_ = improve(
-        dataclasses.replace(ppo, learning_rate=0.0), state, state.replay, key=jax.random.key(0)
-    )
+    still = dataclasses.replace(ppo, learning_rate=0.0)
+    networks = (state.actor, state.critic)
+    actor, *_ = improve(still, networks, state.optimizer, state.replay, key=jax.random.key(0))
     for a, b in zip(jax.tree.leaves(actor), jax.tree.leaves(state.actor), strict=True):
         np.testing.assert_array_equal(a, b)
 

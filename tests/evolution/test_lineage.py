@@ -48,6 +48,7 @@ def test_children_in_every_way(guests):
         parents=index(4, 3, 0, 0),
         mates=index(4, 4, 4, 4),
         crossed=flags(0, 1, 1, 0),
+        taken=jnp.array([0.3, 0.5, 0.5, 0.3]),
         mutated=flags(0, 0, 1, 1),
     )
     made = [INJECTED, INJECTED, CROSSED, CROSSED_AND_MUTATED, MUTATED]
@@ -65,11 +66,13 @@ def test_children_in_every_way(guests):
 
 def test_the_share_of_a_learner_grows_with_each_crossing(guests):
     """Member 0's line is crossed with an elite, which is learner 0's, three times."""
-    lineage, everyone = guests, jnp.ones(4, bool)
-    lineage = lineage.children(index(4), index(0, 0, 0, 0), index(4, 4, 4, 4), everyone, everyone)
+    lineage, everyone, half = guests, jnp.ones(4, bool), jnp.full(4, 0.5)
+    lineage = lineage.children(
+        index(4), index(0, 0, 0, 0), index(4, 4, 4, 4), everyone, half, everyone
+    )
     for share in (0.75, 0.875):
         lineage = lineage.children(
-            index(0), index(1, 2, 3, 4), index(0, 0, 0, 0), everyone, ~everyone
+            index(0), index(1, 2, 3, 4), index(0, 0, 0, 0), everyone, half, ~everyone
         )
         assert lineage.share.tolist() == [[0.0, 1.0, 0.0], *[[1.0 - share, share, 0.0]] * 4]
     assert lineage.maker.tolist() == [INJECTED, *[CROSSED] * 4]

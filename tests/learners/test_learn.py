@@ -25,7 +25,9 @@ def transitions():
     """Rows of two rewards, `b` the square of `a`."""
     draw = np.random.default_rng(0).uniform(-1, 1, (4, ROWS, 2)).astype(np.float32)
     a = draw[2, :, 0]
-    return Transition(draw[0], draw[1, :, :1], {"a": a, "b": a**2}, draw[3], draw[2, :, 1] > 0)
+    return Transition(
+        draw[0], draw[1, :, :1], {"a": a, "b": a**2}, draw[3], draw[2, :, 1] > 0, draw[2, :, 1] > 9
+    )
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,9 @@ def test_it_is_one_update_after_the_other_each_on_rows_of_its_own(replay, start)
         sample_key, update_key = jax.random.split(jax.random.fold_in(KEY, i))
         rows = replay.sample(4, key=sample_key)
         drawn.append(np.asarray(rows.obs).tobytes())
-        batch = Batch(rows.obs, rows.action, rows.rewards["a"], rows.next_obs, rows.terminated)
+        batch = Batch(
+            rows.obs, rows.action, rows.rewards["a"], rows.next_obs, rows.terminated, rows.truncated
+        )
         state, report = update(state, batch, update_key)
         reports.append(report)
     assert len(set(drawn)) == 3

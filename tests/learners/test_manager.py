@@ -14,6 +14,7 @@ def ledger_of(value, count, square=None):
         jnp.asarray(value, jnp.float32),
         jnp.asarray(square, jnp.float32),
         jnp.asarray(count, jnp.int32),
+        jnp.asarray(count) > 0,
     )
 
 
@@ -104,3 +105,20 @@ def test_impossible_settings_are_refused():
         UCB(exploration=-1.0)
     with pytest.raises(ValueError, match="memory is 2"):
         UCB(memory=2.0)
+
+
+@pytest.mark.parametrize("manager", [UCB(), Thompson()])
+def test_a_return_that_is_no_number_costs_a_turn_and_nothing_else(manager):
+    ledger = observe(manager, Ledger.empty(2), 0, [3.0])
+    ledger = observe(manager, ledger, 1, [5.0, np.nan, np.inf])
+    assert ledger.value.tolist() == [3.0, 5.0]
+    assert ledger.count.tolist() == [1, 3]
+    never = observe(manager, observe(manager, Ledger.empty(2), 0, [3.0]), 1, [np.nan])
+    assert never.comparable.tolist() == [3.0, 3.0]
+    workers = manager.allocate(never, 200, key=jax.random.key(0))
+    assert 40 < int(jnp.sum(workers)) < 160
+
+
+def test_thompson_tries_a_learner_of_which_nothing_is_known():
+    ledger = observe(Thompson(), Ledger.empty(2), 0, [1000.0, 1001.0])
+    assert Thompson().allocate(ledger, 5, key=jax.random.key(0)).tolist() == [1] * 5

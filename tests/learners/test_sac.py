@@ -42,7 +42,7 @@ def batch_of(seed):
     obs, action, reward, next_obs, end = (
         np.random.default_rng(seed).uniform(-1, 1, (5, N, OBS)).astype(np.float32)
     )
-    return Batch(obs, action, 3 * reward[:, 0], next_obs, end[:, 0] > 0)
+    return Batch(obs, action, 3 * reward[:, 0], next_obs, end[:, 0] > 0, end[:, 0] > 9)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """TD3 and DDPG: updates as in a NumPy version of the published boxes."""
 
 import copy
+import dataclasses
 
 import equinox as eqx
 import jax
@@ -42,7 +43,8 @@ LEARNERS = {
         actor_lr=0.01,
         critic_lr=0.02,
         tau=0.1,
-        max_norm=0.05,
+        actor_max_norm=0.05,
+        critic_max_norm=0.05,
         batch_size=N,
     ),
 }
@@ -62,7 +64,7 @@ def batch_of(seed):
     obs, action, reward, next_obs, end = (
         np.random.default_rng(seed).uniform(-1, 1, (5, N, OBS)).astype(np.float32)
     )
-    return Batch(obs, action[:, :ACT], 3 * reward[:, 0], next_obs, end[:, 0] > 0)
+    return Batch(obs, action[:, :ACT], 3 * reward[:, 0], next_obs, end[:, 0] > 0, end[:, 0] > 9)
 
 
 def start(name, seed=0):
@@ -83,7 +85,7 @@ class ByHand:
         self.critics = [reference.numpy_of(critic) for critic in state.critics]
         self.target_actor = copy.deepcopy(self.actor)
         self.target_critics = copy.deepcopy(self.critics)
-        max_norm = learner.max_norm or np.inf
+        max_norm = learner.actor_max_norm or np.inf
         self.actor_adam = reference.Adam(learner.actor_lr, max_norm)
         self.critic_adam = reference.Adam(learner.critic_lr, max_norm)
 
@@ -215,7 +217,9 @@ def test_smoothing_noise_is_clipped_and_actions_stay_in_range():
 
 
 def test_both_gradients_are_clipped():
-    learner = eqx.tree_at(lambda t: t.max_norm, LEARNERS["ddpg"], 1e-3)
+    learner = eqx.tree_at(
+        lambda t: (t.actor_max_norm, t.critic_max_norm), LEARNERS["ddpg"], (1e-3, 1e-3)
+    )
     state, _ = update(learner, start("ddpg"), batch_of(0), jax.random.key(0))
     for opt in (state.actor_opt, state.critic_opt):
         first_moment = np.concatenate([x.ravel() for x in jax.tree.leaves(opt[0].mu)])
@@ -257,7 +261,7 @@ def test_ddpg_has_the_constants_of_section_5_4():
     learner = ddpg(gamma=0.9)
     assert (learner.critics, learner.policy_delay, learner.batch_size) == (1, 1, 128)
     assert (learner.actor_lr, learner.critic_lr, learner.tau) == (5e-5, 5e-4, 1e-3)
-    assert (learner.target_noise, learner.max_norm, learner.gamma) == (0.0, 10.0, 0.9)
+    assert (learner.target_noise, learner.critic_max_norm, learner.gamma) == (0.0, 10.0, 0.9)
     assert learner.noise == OrnsteinUhlenbeck(theta=0.15, sigma=0.2, scale=0.3)
     assert (learner.critic.branches, learner.critic.hidden) == ((200, 200), (300,))
     assert ddpg().gamma == TD3().gamma == 0.99
@@ -284,3 +288,26 @@ def test_a_network_with_memory_is_refused():
 def test_impossible_settings_are_refused(fields, told):
     with pytest.raises(ValueError, match=told):
         TD3(**fields)
+
+
+def test_a_time_limit_may_count_as_the_end():
+    """As in the author's code; by default it is bootstrapped through."""
+    batch = eqx.tree_at(lambda b: b.truncated, batch_of(0), np.ones(N, bool))
+    state = start("ddpg")
+    through = bellman_target(LEARNERS["ddpg"], state, batch, jax.random.key(0))
+    ends = dataclasses.replace(LEARNERS["ddpg"], bootstrap_truncated=False)
+    target = bellman_target(ends, state, batch, jax.random.key(0))
+    np.testing.assert_array_equal(target, batch.reward)
+    assert np.any(np.asarray(through) != batch.reward)
+
+
+def test_the_actor_of_a_learner_may_start_small():
+    learner = dataclasses.replace(LEARNERS["ddpg"], actor_scale=0.1)
+    full, small = (
+        made.init(NETWORK, OBS, ACT, key=jax.random.key(0)).actor.weights
+        for made in (dataclasses.replace(learner, actor_scale=1.0), learner)
+    )
+    last = len(NETWORK.hidden)
+    for name in full:
+        scale = 0.1 if name in (f"W_{last}", f"b_{last}") else 1.0
+        np.testing.assert_allclose(small[name], scale * full[name], rtol=1e-6)

@@ -210,15 +210,14 @@ def test_buffers_that_a_device_holds_give_the_same_files(tmp_path, monkeypatch, 
 
 def test_with_the_buffer_itself(tmp_path):
     """Saved, extended with donation, and saved again: nothing that was saved changes."""
-    row = Transition(
-        jnp.zeros(3), jnp.zeros(1), {"task": jnp.float32(0)}, jnp.zeros(3), jnp.bool_(False)
-    )
+    no = jnp.bool_(False)
+    row = Transition(jnp.zeros(3), jnp.zeros(1), {"task": jnp.float32(0)}, jnp.zeros(3), no, no)
 
     def rows(n: int) -> Transition:
         random = np.random.default_rng(n).standard_normal((n, 8), np.float32)
         ended = random[:, 0] > 0
         return Transition(
-            random[:, :3], random[:, 3:4], {"task": random[:, 4]}, random[:, 5:], ended
+            random[:, :3], random[:, 3:4], {"task": random[:, 4]}, random[:, 5:], ended, ~ended
         )
 
     buffer = replay.extend(Replay.empty(row, 50), rows(33))

@@ -62,7 +62,7 @@ class ERLState(eqx.Module):
     replay: Any  # a Replay, or None where nobody learns
     ledger: Ledger
     allocation: Int[Array, " b"]  # the learner of each rollout worker
-    champion: AbstractPolicy  # the fittest of the generation before
+    champion: AbstractPolicy  # the fittest of a generation, as last tested
     score: Float[Array, ""]  # of the champion that was tested last
     frames: Int[Array, ""]
     episodes: Int[Array, ""]
@@ -109,11 +109,17 @@ class ERL(eqx.Module):
                 f"elite_fraction is {self.elite_fraction} of {self.population_size} members: that "
                 f"must be at least 1, and leave {max(1, len(self.learners))} slots for offspring"
             )
+        if self.manager is None and self.workers < len(self.learners):
+            raise ValueError(
+                f"{self.workers} workers for {len(self.learners)} learners: some would never play; "
+                "give at least as many"
+            )
 
     @classmethod
     def erl(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """Section 5.4, with the task's column of Table 5.1."""
-        name = str(getattr(env, "id", "")).partition("-v")[0]
+        """Section 5.4, with the task's column of Table 5.1; HalfCheetah's where it has none."""
+        inner = getattr(env, "env", env)  # a delayed task is still that task
+        name = str(getattr(inner, "id", "")).partition("-v")[0]
         ψ, ξ, ω = TABLE_5_1.get(name, TABLE_5_1["HalfCheetah"])
         settings: dict[str, Any] = {"elite_fraction": ψ, "episodes": ξ, "sync_period": ω}
         if network is not None:
@@ -197,7 +203,7 @@ class ERL(eqx.Module):
         replay: Any = extend(state.replay, rows, valid) if self.learners else None
 
         # 8-15: rank, keep the elites, select, cross and mutate.
-        population, lineage, champion, bred = breed(
+        population, lineage, fittest, bred = breed(
             self, state.population, state.lineage, fitness, key=breed_key
         )
         # 16-20: learners play too, with noise; what they earn is their value.
@@ -253,9 +259,11 @@ class ERL(eqx.Module):
             population = tree.where(sync, guests, population)
             lineage = tree.where(sync, lineage.inject(slot, i), lineage)
 
+        due = (generation - 1) % self.test_every == 0
+        champion = tree.where(due, fittest, state.champion)  # what is saved is what was tested
         score = when(
-            (generation - 1) % self.test_every == 0,
-            lambda: jnp.mean(self.test(champion, key=test_key)),
+            due,
+            lambda: jnp.mean(self.test(fittest, key=test_key)),
             lambda: state.score,
         )
         metrics |= bred | {
@@ -323,6 +331,7 @@ def breed(
     )
     offspring = eqx.filter_vmap(tree.where)(crossed, children, survivors)
     # 13-15: Mutate set S.
+    taken = eqx.filter_vmap(share_of)(offspring, tree.take(population, mates), survivors)
     mutants = eqx.filter_vmap(lambda genome, key: erl.mutation(genome, key=key))(
         offspring, jax.random.split(mutate_key, n)
     )
@@ -336,7 +345,7 @@ def breed(
         metrics |= {f"{fate}_{i}": count[i] for fate, count in fates.items()}
     return (
         tree.concat(tree.take(population, elites), mutants),
-        lineage.children(elites, parents, mates, crossed, mutated),
+        lineage.children(elites, parents, mates, crossed, taken, mutated),
         tree.take(population, champion),
         metrics,
     )
@@ -352,6 +361,13 @@ def observe(
 ) -> Ledger:
     """The ledger with the first `played` returns of learner `i`."""
     return manager.observe(ledger, i, returns, jnp.arange(returns.shape[0]) < played)
+
+
+def share_of(child: PyTree, mate: PyTree, survivor: PyTree) -> Float[Array, ""]:
+    """The share of a child's weights that are its mate's, of those in which its parents differ."""
+    c, m, s = (tree.ravel(genome)[0] for genome in (child, mate, survivor))
+    differ = (m != s).astype(jnp.float32)
+    return jnp.sum(differ * (c == m).astype(jnp.float32)) / jnp.maximum(jnp.sum(differ), 1.0)
 
 
 def differ(a: PyTree, b: PyTree) -> Array:

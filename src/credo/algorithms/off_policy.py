@@ -63,9 +63,7 @@ class OffPolicy(eqx.Module):
     @classmethod
     def ddpg(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of ERL's learner (Khadka 2019, section 5.4)."""
-        network = network or MLP(
-            hidden=(128, 128), normalization="before", initializer="uniform", output_scale=0.1
-        )
+        network = network or MLP(hidden=(128, 128), normalization="before", initializer="uniform")
         settings = {"learner": ddpg(), "start_frames": 1_000}
         return cls(env, network, **settings | overrides)
 
@@ -88,9 +86,11 @@ class OffPolicy(eqx.Module):
         return OffPolicyState(learner, replay, actor, jnp.float32(jnp.nan), jnp.int32(0))
 
     def warm(self, state: OffPolicyState, policy: AbstractPolicy) -> OffPolicyState:
-        """`state` that goes on from a saved policy of the same network."""
+        """`state` that goes on from a saved policy of the same network, without random actions. Its
+        critics are new."""
         learner = self.learner.warm(state.learner, policy)
-        return OffPolicyState(learner, state.replay, policy, state.score, state.frames)
+        frames = jnp.int32(self.start_frames)
+        return OffPolicyState(learner, state.replay, policy, state.score, frames)
 
     def generation(
         self, state: OffPolicyState, *, key: PRNGKeyArray

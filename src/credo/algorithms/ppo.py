@@ -118,7 +118,7 @@ class PPO(eqx.Module):
         most = self.copies * env.max_steps
         replay = Replay.empty(blank(env), min(most, self.horizon + 8 * env.max_steps))
         opt = adam_state((actor, critic))
-        length = jnp.float32(self.horizon / self.copies)
+        length = jnp.float32(min(self.horizon, env.max_steps))
         score = jnp.float32(jnp.nan)
         return PPOState(actor, critic, opt, replay, mean, score, length, jnp.int32(0))
 
@@ -145,7 +145,10 @@ class PPO(eqx.Module):
         frames = state.frames + new
 
         # Compute advantages; optimize the surrogate with K epochs of minibatches.
-        actor, critic, opt, metrics = improve(self, state, replay, key=learn_key)
+        networks = (state.actor, state.critic)
+        actor, critic, opt, metrics = improve(
+            self, networks, state.optimizer, replay, key=learn_key
+        )
 
         due = (frames // self.test_every > state.frames // self.test_every) | (state.frames == 0)
         score = when(
@@ -177,12 +180,17 @@ class PPO(eqx.Module):
 
 @jit
 def improve(
-    ppo: PPO, state: PPOState, replay: Replay, *, key: PRNGKeyArray
+    ppo: PPO,
+    networks: tuple[Actor, CriticNetwork],
+    optimizer: optax.OptState,
+    replay: Replay,
+    *,
+    key: PRNGKeyArray,
 ) -> tuple[Actor, CriticNetwork, optax.OptState, Metrics]:
     """K epochs of minibatches of M frames. How many frames there are is data."""
-    sample = prepare(ppo, state, replay)
+    sample = prepare(ppo, networks, replay)
     batches = replay.size // ppo.batch_size
-    weights, static = eqx.partition((state.actor, state.critic), eqx.is_inexact_array)
+    weights, static = eqx.partition(networks, eqx.is_inexact_array)
 
     def epoch(k, loop):
         # A permutation of the frames, in minibatches; what is left over is left out.
@@ -202,23 +210,23 @@ def improve(
         return jax.lax.fori_loop(0, batches, step, loop)
 
     zeros = {name: jnp.float32(0.0) for name in ("policy_loss", "critic_loss", "clipped")}
-    loop = jax.lax.fori_loop(0, ppo.epochs, epoch, (weights, state.optimizer, zeros))
+    loop = jax.lax.fori_loop(0, ppo.epochs, epoch, (weights, optimizer, zeros))
     weights, opt, total = loop
     actor, critic = eqx.combine(weights, static)
     count = (ppo.epochs * batches).astype(jnp.float32)
     return actor, critic, opt, {name: x / count for name, x in total.items()}
 
 
-def prepare(ppo: PPO, state: PPOState, replay: Replay) -> Sample:
+def prepare(ppo: PPO, networks: tuple[Actor, CriticNetwork], replay: Replay) -> Sample:
     """Advantages by equation 11 and what goes with them, normalised over the frames."""
+    actor, critic = networks
     rows: Transition = replay.data
     filled = jnp.arange(replay.capacity) < replay.size
     reward = rows.rewards[ppo.signal or ppo.env.signals[0]]
-    value, after = (_value(state.critic, obs) for obs in (rows.obs, rows.next_obs))
+    value, after = (_value(critic, obs) for obs in (rows.obs, rows.next_obs))
     delta = reward + ppo.gamma * jnp.where(rows.terminated, 0.0, after) - value
-    # An episode goes on in the next row if that begins where this one ends.
-    follows = jnp.all(rows.next_obs[:-1] == rows.obs[1:], axis=1) & ~rows.terminated[:-1]
-    goes_on = jnp.append(follows, False) & jnp.append(filled[1:], False)
+    # Rows come episode by episode.
+    goes_on = ~(rows.terminated | rows.truncated) & jnp.append(filled[1:], False)
     advantage = advantages(delta, goes_on, ppo.gamma * ppo.gae)
     n = jnp.maximum(replay.size, 1).astype(jnp.float32)
     mean = jnp.sum(jnp.where(filled, advantage, 0.0)) / n
@@ -226,7 +234,7 @@ def prepare(ppo: PPO, state: PPOState, replay: Replay) -> Sample:
     return Sample(
         rows.obs,
         rows.action,
-        state.actor.log_density(rows.obs, rows.action),
+        actor.log_density(rows.obs, rows.action),
         (advantage - mean) / (jnp.sqrt(variance) + 1e-8),
         advantage + value,
     )

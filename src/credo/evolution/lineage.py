@@ -28,12 +28,13 @@ class Lineage(eqx.Module):
         parents: Int[Array, " n"],
         mates: Int[Array, " n"],
         crossed: Bool[Array, " n"],
+        taken: Float[Array, " n"],
         mutated: Bool[Array, " n"],
     ) -> "Lineage":
-        """Of the next population: elites as they are, then a child of each parent. A crossed
-        child has half of its rows from its mate."""
-        both = 0.5 * (self.share[parents] + self.share[mates])
-        share = jnp.where(crossed[:, None], both, self.share[parents])
+        """Of the next population: elites as they are, then a child of each parent, which has the
+        share `taken` of its weights from its mate if it was crossed."""
+        from_mate = jnp.where(crossed, taken, 0.0)[:, None]
+        share = (1.0 - from_mate) * self.share[parents] + from_mate * self.share[mates]
         made = jnp.where(
             mutated,
             jnp.where(crossed, CROSSED_AND_MUTATED, MUTATED),

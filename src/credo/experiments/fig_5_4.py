@@ -42,8 +42,8 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         chapter5.scores(measured),
         chapter5.about(
             measured,
-            "Without selection parents are drawn uniformly. The champion that is tested is still "
-            "the fittest of its generation.",
+            "Without selection parents and elites are drawn uniformly. The champion that is tested "
+            "is still the fittest of its generation.",
         ),
     ]
 

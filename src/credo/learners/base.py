@@ -86,7 +86,8 @@ def _learn(
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
         rows = replay.sample(learner.batch_size, key=sample_key)
         reward = rows.rewards[signal]
-        batch = Batch(rows.obs, rows.action, reward, rows.next_obs, rows.terminated)
+        ends = (rows.terminated, rows.truncated)
+        batch = Batch(rows.obs, rows.action, reward, rows.next_obs, *ends)
         state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)
         return eqx.filter(state, eqx.is_array), metrics
 

@@ -19,10 +19,17 @@ class Ledger(eqx.Module):
     value: Float[Array, " q"]  # running mean v of its returns
     square: Float[Array, " q"]  # running mean of their squares
     count: Int[Array, " q"]  # returns so far, y; their sum is H
+    known: Bool[Array, " q"]  # whether any of them was a number
 
     @classmethod
     def empty(cls, q: int) -> "Ledger":
-        return cls(jnp.zeros(q), jnp.zeros(q), jnp.zeros(q, jnp.int32))
+        return cls(jnp.zeros(q), jnp.zeros(q), jnp.zeros(q, jnp.int32), jnp.zeros(q, bool))
+
+    @property
+    def comparable(self) -> Float[Array, " q"]:
+        """Values; of a learner without one, the least of the others."""
+        least = jnp.min(jnp.where(self.known, self.value, jnp.inf))
+        return jnp.where(self.known, self.value, jnp.where(jnp.isfinite(least), least, 0.0))
 
 
 class AbstractManager(eqx.Module):
@@ -38,13 +45,17 @@ class AbstractManager(eqx.Module):
 
         def one(ledger, new):
             value, counts = new
-            α = jnp.where(ledger.count[i] == 0, 1.0, self.memory)
+            # A learner that said NaN has had its turn, but no value that could be compared.
+            good = jnp.isfinite(value)
+            value = jnp.where(good, value, 0.0)
+            α = jnp.where(ledger.known[i], self.memory, 1.0)
             mean = α * value + (1.0 - α) * ledger.value[i]
             square = α * value**2 + (1.0 - α) * ledger.square[i]
             after = Ledger(
-                ledger.value.at[i].set(mean),
-                ledger.square.at[i].set(square),
+                jnp.where(good, ledger.value.at[i].set(mean), ledger.value),
+                jnp.where(good, ledger.square.at[i].set(square), ledger.square),
                 ledger.count.at[i].add(1),
+                ledger.known.at[i].set(ledger.known[i] | good),
             )
             return jax.tree.map(lambda a, b: jnp.where(counts, a, b), after, ledger), None
 
@@ -73,7 +84,7 @@ class UCB(AbstractManager):
     def bounds(self, ledger: Ledger) -> Float[Array, " q"]:
         """U_i = v̂_i + c √(ln H / y_i), v̂ the values normalised to [0, 1). A learner that was never
         tried counts as tried once."""
-        above = ledger.value - jnp.min(ledger.value)
+        above = ledger.comparable - jnp.min(ledger.comparable)
         # The author's 0.1 keeps equal values from a division by 0.
         value = above / (jnp.sum(above) + 0.1)
         total = jnp.maximum(jnp.sum(ledger.count), 1).astype(jnp.float32)
@@ -97,6 +108,10 @@ class Thompson(AbstractManager):
 
     memory: float = 0.2  # α
 
+    def __check_init__(self):
+        if isinstance(self.memory, float) and not 0.0 < self.memory <= 1.0:
+            raise ValueError(f"memory is {self.memory}: it must lie in (0, 1]")
+
     def allocate(self, ledger, workers, *, key):
         variance = jnp.maximum(ledger.square - ledger.value**2, 0.0)
         # A running mean with weight α rests on (2 - α)/α returns, at most.
@@ -104,7 +119,9 @@ class Thompson(AbstractManager):
         rests_on = jnp.clip(ledger.count.astype(jnp.float32), 1.0, most)
         spread = jnp.sqrt(variance / rests_on) + 1e-3 * (1.0 + jnp.abs(ledger.value))
         drawn = jax.random.normal(key, (workers, ledger.value.shape[0]))
-        return jnp.argmax(ledger.value[None] + spread[None] * drawn, axis=1)
+        imagined = ledger.comparable[None] + spread[None] * drawn
+        # Nothing is known of a learner that never played: it is the next to.
+        return jnp.argmax(jnp.where(ledger.count[None] == 0, jnp.inf, imagined), axis=1)
 
 
 def even(workers: int, q: int) -> Int[Array, " b"]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from .. import require
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import AbstractNoise, Explorer, GaussianNoise, OrnsteinUhlenbeck
-from ..networks.mlp import Critic, CriticNetwork
+from ..networks.mlp import Critic, CriticNetwork, MLPPolicy
 from ..types import Batch, Metrics
 from .base import AbstractLearner, act, adam, adam_state, polyak, require_memoryless
 
@@ -47,7 +47,11 @@ class TD3(AbstractLearner):
     noise: AbstractNoise = GaussianNoise()  # exploration
     critics: int = eqx.field(static=True, default=2)  # the least of them is believed
     policy_delay: int = eqx.field(static=True, default=2)  # critic steps per step of the actor
-    max_norm: float | None = None  # both gradients are clipped to this norm
+    actor_max_norm: float | None = None  # the actor's gradient is clipped to this norm
+    critic_max_norm: float | None = None  # the critics' too
+    actor_scale: float = 1.0  # of the fresh actor's output layer
+    bootstrap_truncated: bool = eqx.field(static=True, default=True)
+    """A time limit is not the end of the task; False: it counts as one, as in the author's code."""
     batch_size: int = eqx.field(static=True, default=256)
     signal: str | None = eqx.field(static=True, default=None)
 
@@ -65,6 +69,8 @@ class TD3(AbstractLearner):
         actor_key, critic_key = jax.random.split(key)
         actor = network.init(obs_size, action_size, key=actor_key)
         require_memoryless(network, actor)
+        if isinstance(actor, MLPPolicy):
+            actor = actor.scaled(self.actor_scale)
         critics = tuple(
             self.critic.init(obs_size, action_size, key=key)
             for key in jax.random.split(critic_key, self.critics)
@@ -87,14 +93,14 @@ class TD3(AbstractLearner):
             state.critics, batch, target
         )
         critics, critic_opt = adam(
-            state.critics, gradient, state.critic_opt, self.critic_lr, self.max_norm
+            state.critics, gradient, state.critic_opt, self.critic_lr, self.critic_max_norm
         )
         moving = (state.actor, state.actor_opt, state.target_actor, state.target_critics)
 
         def move_policy():
             actor, actor_opt, target_actor, target_critics = moving
             gradient = eqx.filter_grad(actor_loss)(actor, critics[0], batch)
-            actor, actor_opt = adam(actor, gradient, actor_opt, self.actor_lr, self.max_norm)
+            actor, actor_opt = adam(actor, gradient, actor_opt, self.actor_lr, self.actor_max_norm)
             target_actor = polyak(target_actor, actor, self.tau)
             return actor, actor_opt, target_actor, polyak(target_critics, critics, self.tau)
 
@@ -118,7 +124,10 @@ class TD3(AbstractLearner):
         action = jnp.clip(act(state.target_actor, batch.next_obs) + noise, -1.0, 1.0)
         qs = [critic(batch.next_obs.T, action.T) for critic in state.target_critics]
         q = jnp.min(jnp.stack(qs), axis=0)
-        return batch.reward + self.gamma * jnp.where(batch.terminated, 0.0, q)
+        ended = batch.terminated
+        if not self.bootstrap_truncated:
+            ended = ended | batch.truncated
+        return batch.reward + self.gamma * jnp.where(ended, 0.0, q)
 
     def actor(self, state: TD3State) -> AbstractPolicy:
         return state.actor
@@ -148,7 +157,9 @@ def ddpg(**fields) -> TD3:
         "actor_lr": 5e-5,
         "critic_lr": 5e-4,
         "tau": 1e-3,
-        "max_norm": 10.0,
+        "actor_max_norm": 10.0,
+        "critic_max_norm": 10.0,
+        "actor_scale": 0.1,
         "batch_size": 128,
     }
     return TD3(**(settings | fields))

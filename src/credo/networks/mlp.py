@@ -71,6 +71,12 @@ class MLPPolicy(AbstractPolicy):
         """The last layer, before its activation."""
         return linear(self.weights, len(self.config.hidden), features)
 
+    def scaled(self, factor: Float[Array, ""] | float) -> "MLPPolicy":
+        """With the output layer's weights times `factor`."""
+        last = len(self.config.hidden)
+        changed = {name: factor * self.weights[name] for name in (f"W_{last}", f"b_{last}")}
+        return MLPPolicy(self.weights | changed, self.config)
+
     def action(self, output: Float[Array, "act *batch"]) -> Float[Array, "act *batch"]:
         """The output, before its activation, as an action in [-1, 1]."""
         kind = self.config.output_activation

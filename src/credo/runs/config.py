@@ -28,6 +28,7 @@ from ..evolution.crossover import AbstractCrossover
 from ..evolution.mutation import AbstractMutation
 from ..evolution.selection import AbstractSelection
 from ..learners.base import AbstractLearner
+from ..learners.manager import AbstractManager
 from ..networks.base import AbstractNetwork
 from ..networks.exploration import AbstractNoise
 
@@ -39,6 +40,7 @@ EXTENSIONS = (
     AbstractCrossover,
     AbstractSelection,
     AbstractLearner,
+    AbstractManager,
     AbstractNoise,
 )
 PACKAGES = ("credo", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")

@@ -57,7 +57,9 @@ class Job:
         if not (self.path / "config.json").exists():
             return False
         run = Run(self.path)
-        lines = config.differences(run.config["algorithm"], self.tree)
+        # A field that came after that run has its default.
+        of_today = config.to_tree(config.from_tree(run.config["algorithm"]))
+        lines = config.differences(of_today, self.tree)
         recorded, budget = Budget.read(run.config["budget"]), self.budget
         for name in ("generations", "frames"):
             old, new = getattr(recorded, name), getattr(budget, name)
