@@ -40,7 +40,7 @@ def filled() -> Replay:
     obs, next_obs = (rng.normal(size=(ROWS, OBS)).astype(np.float32) for _ in range(2))
     action = rng.uniform(-1, 1, (ROWS, ACT)).astype(np.float32)
     rewards = {"reward": rng.normal(size=ROWS).astype(np.float32)}
-    rows = Transition(obs, action, rewards, next_obs, np.zeros(ROWS, bool))
+    rows = Transition(obs, action, rewards, next_obs, *np.zeros((2, ROWS), bool))
     row = jax.tree.map(lambda x: jnp.asarray(x[0]), rows)
     return extend(Replay.empty(row, ROWS), rows)
 
