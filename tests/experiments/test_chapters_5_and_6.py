@@ -102,7 +102,7 @@ def test_the_double_pendulum_is_played_both_ways():
     name = "InvertedDoublePendulum-v5"
     cells = {cell.name: cell for cell in fig_5_2.cells("full")}
     assert list(cells) == [
-        f"{kind} {name}{suffix}" for suffix in ("", " delayed") for kind in ("erl", "ddpg", "ea")
+        f"{kind} {name}{suffix}" for suffix in ("", " delayed") for kind in ("erl", "erl ours", "ddpg", "ea")
     ]
     assert cells[f"erl {name}"].algorithm == ERL.erl(Gymnasium(name), test_episodes=10)
     hard = cells[f"ddpg {name} delayed"].algorithm
