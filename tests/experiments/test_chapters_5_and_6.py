@@ -108,8 +108,8 @@ def test_the_double_pendulum_is_played_both_ways():
     hard = cells[f"ddpg {name} delayed"].algorithm
     assert hard == OffPolicy.ddpg(DelayedHostReward(Gymnasium(name)), test_episodes=10)
     assert all(cell.stop_at == 9000 and cell.runs == 3 for cell in cells.values())
-    # As many episodes as were published to be needed.
-    assert cells[f"erl {name} delayed"].generations * 11 >= 10_000
+    # Within the episodes that were published to be needed.
+    assert 9_900 < cells[f"erl {name} delayed"].generations * 11 <= 10_000
     assert cells[f"ea {name} delayed"].generations * 10 >= 25_000
 
 
@@ -179,7 +179,7 @@ def test_evolution_alone_makes_no_updates(runs_of):
 
 
 def test_a_pendulum_is_solved_when_its_test_says_so(tmp_path):
-    erl, ddpg = fig_5_2.cells("smoke")[:2]
+    erl, _, ddpg = fig_5_2.cells("smoke")[:3]
     scores = {"champion_score": np.r_[np.zeros(9), 9001.0, np.zeros(10)]}
     runs = {
         erl.name: [fake(tmp_path / "a", erl.algorithm, 0, **scores)],
