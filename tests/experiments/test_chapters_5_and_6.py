@@ -101,8 +101,9 @@ def test_the_check_of_td3_is_td3_as_it_comes():
 def test_the_double_pendulum_is_played_both_ways():
     name = "InvertedDoublePendulum-v5"
     cells = {cell.name: cell for cell in fig_5_2.cells("full")}
+    kinds = ("erl", "erl ours", "ddpg", "ea")
     assert list(cells) == [
-        f"{kind} {name}{suffix}" for suffix in ("", " delayed") for kind in ("erl", "erl ours", "ddpg", "ea")
+        f"{kind} {name}{suffix}" for suffix in ("", " delayed") for kind in kinds
     ]
     assert cells[f"erl {name}"].algorithm == ERL.erl(Gymnasium(name), test_episodes=10)
     hard = cells[f"ddpg {name} delayed"].algorithm
