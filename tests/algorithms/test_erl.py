@@ -472,7 +472,7 @@ def test_erl_has_its_tasks_column_of_table_5_1(task):
 
 def test_presets_and_what_they_share():
     presets = {name: make(Copy()) for name, make in ERL.presets().items()}
-    assert set(presets) == {"erl", "ea", "cerl"}
+    assert set(presets) == {"erl", "ours", "ea", "cerl"}
     erl, ea, cerl = presets["erl"], presets["ea"], presets["cerl"]
     assert dataclasses.replace(erl, learners=()) == ea
     assert (erl.elite_fraction, erl.episodes, erl.sync_period) == (0.1, 1, 10)
