@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from credo.algorithms.off_policy import OffPolicy
 from credo.learners.base import learn
-from credo.learners.td3 import TD3
+from credo.learners.td3 import TD3, TD3_NETWORK
 from credo.replay import Replay, extend
 from credo.types import Transition
 
@@ -54,10 +53,10 @@ def seconds(run) -> float:
 
 def main() -> None:
     replay = filled()
-    network = OffPolicy.__dataclass_fields__["network"].default
     learners = [TD3(gamma=γ) for γ in (0.9, 0.99, 0.997, 0.9995)]
     states = [
-        learner.init(network, OBS, ACT, key=jax.random.key(i)) for i, learner in enumerate(learners)
+        learner.init(TD3_NETWORK, OBS, ACT, key=jax.random.key(i))
+        for i, learner in enumerate(learners)
     ]
 
     def update(i):

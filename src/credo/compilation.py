@@ -3,6 +3,7 @@
 import functools
 import os
 import pathlib
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -41,6 +42,14 @@ def jit(function: Any = None, *, donate: Any = "none") -> Any:
         return (inner if traced else outer)(*args, **kwargs)
 
     return call
+
+
+def when(due: Any, play: Callable[[], Any], skip: Callable[[], Any]) -> Any:
+    """`play()` if the scalar `due`, else `skip()`; as part of a program only where `due` is traced,
+    so that what reaches outside JAX can be called where it is not."""
+    if isinstance(due, jax.core.Tracer):
+        return jax.lax.cond(due, play, skip)
+    return play() if due else skip()
 
 
 def enable_cache() -> None:

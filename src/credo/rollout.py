@@ -64,6 +64,14 @@ def collect(
     return _collect(env, population, episodes, jnp.int32(wanted), common, key=key)
 
 
+def score(
+    env: Environment, policy: AbstractPolicy, episodes: int, *, key: PRNGKeyArray
+) -> Float[Array, ""]:
+    """Mean return of one policy on fresh episodes, of the signal that the task reports."""
+    played = evaluate(env, tree.stack(policy), episodes, key=key)
+    return jnp.mean(played.returns[env.signals[-1]])
+
+
 def blank(env: Environment) -> Transition:
     """A transition of this task, all zeros: its shapes and types."""
     if isinstance(env, AbstractHostEnvironment):

@@ -188,8 +188,10 @@ def test_the_champions_origin_is_that_of_the_member_it_was(erl):
 def test_the_score_is_the_champions_on_fresh_episodes(erl):
     rows, states = erl
     for g in (1, 5):
-        played = ALGORITHM.test(states[g].champion, key=jax.random.split(key_of(g), 6)[5])
-        assert played.shape == (1, 2)
+        key = jax.random.split(key_of(g), 6)[5]
+        played = rollout.evaluate(ALGORITHM.env, tree.stack(states[g].champion), 2, key=key)
+        played = played.returns[ALGORITHM.env.signals[-1]]
+        assert (played.shape, ALGORITHM.test_episodes) == ((1, 2), 2)
         assert rows[g - 1]["champion_score"] == pytest.approx(float(jnp.mean(played)), rel=1e-6)
     assert rows[0]["champion_score"] <= 0.0  # the last signal, effort, is what is reported
 

@@ -11,6 +11,7 @@ import pytest
 from compilations import compilations
 from walk import HostWalk, Walk
 
+from credo import rollout, tree
 from credo.algorithms.off_policy import OffPolicy
 from credo.compilation import jit
 from credo.environments.probes import Copy
@@ -121,8 +122,9 @@ def test_tests_come_every_so_many_frames_and_fix_the_champion(host):
 def test_the_score_is_the_actors_without_noise(host):
     rows, states = host
     key = jax.random.split(jax.random.fold_in(jax.random.key(0), 1), 3)[2]
-    played = ALGORITHM.test(states[1].champion, key=key)
-    assert played.shape == (1, 2)
+    played = rollout.evaluate(ALGORITHM.env, tree.stack(states[1].champion), 2, key=key)
+    played = played.returns[ALGORITHM.env.signals[-1]]
+    assert (played.shape, ALGORITHM.test_episodes) == ((1, 2), 2)
     assert float(jnp.mean(played)) == pytest.approx(rows[0]["champion_score"], rel=1e-6)
     # Of the task's last signal, which is what is reported.
     assert rows[0]["champion_score"] <= 0.0

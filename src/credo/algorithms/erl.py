@@ -15,6 +15,8 @@ Departures from the printed boxes:
 - Line 23 weighs up the weakest of a population just bred, of which none has a fitness yet; it is
   the offspring of the weakest parent here.
 - Mutation adds noise in proportion to a weight and hits matrices alone, as the author's code.
+- All members of a generation play in the same worlds; crossover draws rows independently.
+- A learner's first return is its value, and returns that are no numbers leave it as it is.
 - Time limits bootstrap, both gradients are clipped, and OU noise starts anew with each episode.
 """
 
@@ -24,23 +26,22 @@ from typing import Any, ClassVar, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from .. import require, tree
-from ..compilation import jit
+from .. import require, rollout, tree
+from ..compilation import jit, when
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.lineage import Lineage
 from ..evolution.mutation import AbstractMutation, MatrixMutation
 from ..evolution.selection import AbstractSelection, Tournament, rankable, ranking, repeated
 from ..learners.base import AbstractLearner, learn
 from ..learners.manager import UCB, AbstractManager, Ledger, even
-from ..learners.td3 import TD3, ddpg
+from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, ddpg
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.mlp import MLP, Critic
 from ..replay import Replay, extend
-from ..rollout import Environment, blank, collect, evaluate
+from ..rollout import Environment, blank, collect
 from ..types import Metrics
-from .off_policy import when
 
 TABLE_5_1 = {  # task: (ψ, ξ, ω)
     "HalfCheetah": (0.1, 1, 10),
@@ -75,7 +76,7 @@ class ERL(eqx.Module):
     default_budget: ClassVar[dict[str, int]] = {"frames": 1_000_000}
 
     env: Environment
-    network: AbstractNetwork = MLP(hidden=(128, 128), normalization="before", initializer="uniform")
+    network: AbstractNetwork = ERL_NETWORK
     learners: tuple[AbstractLearner, ...] = (ddpg(),)
     population_size: int = eqx.field(static=True, default=10)  # k
     elite_fraction: float = eqx.field(static=True, default=0.1)  # ψ
@@ -122,9 +123,7 @@ class ERL(eqx.Module):
         name = str(getattr(inner, "id", "")).partition("-v")[0]
         ψ, ξ, ω = TABLE_5_1.get(name, TABLE_5_1["HalfCheetah"])
         settings: dict[str, Any] = {"elite_fraction": ψ, "episodes": ξ, "sync_period": ω}
-        if network is not None:
-            settings["network"] = network
-        return cls(env, **settings | overrides)
+        return cls(env, network or ERL_NETWORK, **settings | overrides)
 
     @classmethod
     def ours(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
@@ -150,7 +149,6 @@ class ERL(eqx.Module):
     def cerl(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """Chapter 6: TD3 at four discounts, ten workers, UCB. What the text leaves open is the
         author's: ω = 5, a fifth are elites."""
-        network = network or MLP(hidden=(256, 256), activation="relu", initializer="uniform")
         settings = {
             "learners": tuple(TD3(gamma=γ) for γ in (0.9, 0.99, 0.997, 0.9995)),
             "workers": 10,
@@ -160,7 +158,7 @@ class ERL(eqx.Module):
             "test_episodes": 10,
             "test_every": 5,
         }
-        return cls(env, network, **settings | overrides)
+        return cls(env, network or TD3_NETWORK, **settings | overrides)
 
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
@@ -222,43 +220,14 @@ class ERL(eqx.Module):
             self, state.population, state.lineage, fitness, key=breed_key
         )
         # 16-20: learners play too, with noise; what they earn is their value.
-        ledger, metrics = state.ledger, {}
-        for i, (learner, learner_state) in enumerate(
-            zip(self.learners, state.learners, strict=True)
-        ):
-            workers = jnp.sum((state.allocation == i).astype(jnp.int32))
-            explorer = learner.explorer(learner_state, jnp.bool_(False))
-            played, experience = collect(
-                self.env,
-                tree.stack(explorer),
-                self.workers,
-                wanted=workers,
-                common=False,
-                key=jax.random.fold_in(explore_key, i),
-            )
-            replay = extend(replay, experience.transitions, experience.valid)
-            frames, episodes = frames + jnp.sum(played.steps), episodes + workers
-            ledger = observe(
-                self.manager or UCB(), ledger, i, played.returns[self.signal][0], workers
-            )
-            metrics |= {f"workers_{i}": workers, f"value_{i}": ledger.value[i]}
+        replay, ledger, counts, explored = self.explore(state, replay, key=explore_key)
+        frames, episodes = frames + counts[0], episodes + counts[1]
 
         # 21-29: as many updates as frames, each learner on minibatches of its own.
         ready = (state.frames >= self.warmup_frames) & bool(self.learners)
         updates = jnp.where(ready, frames.astype(jnp.float32) * self.updates_per_frame, 0.0)
         updates = updates.astype(jnp.int32)
-        learners = []
-        for i, learner in enumerate(self.learners):
-            learned, report = learn(
-                learner,
-                state.learners[i],
-                replay,
-                updates,
-                signal=self.signal,
-                key=jax.random.fold_in(learn_key, i),
-            )
-            learners.append(learned)
-            metrics |= {f"{name}_{i}": value for name, value in report.items()}
+        learners, learned = self.learn(state.learners, replay, updates, key=learn_key)
 
         # 30-33: allocate the workers of the next generation.
         allocation = state.allocation
@@ -268,20 +237,17 @@ class ERL(eqx.Module):
         # 34-36: every ω generations, copy each learner's actor over the weakest.
         generation = state.generation + 1
         sync = (generation % self.sync_period == 0) & (updates > 0)
-        for i, learner in enumerate(self.learners):
-            slot = self.population_size - 1 - i
-            guests = tree.put(population, slot, learner.actor(learners[i]))
-            population = tree.where(sync, guests, population)
-            lineage = tree.where(sync, lineage.inject(slot, i), lineage)
+        actors = [learner.actor(s) for learner, s in zip(self.learners, learners, strict=True)]
+        population, lineage = inject(population, lineage, actors, sync)
 
         due = (generation - 1) % self.test_every == 0
         champion = tree.where(due, fittest, state.champion)  # what is saved is what was tested
         score = when(
             due,
-            lambda: jnp.mean(self.test(fittest, key=test_key)),
+            lambda: rollout.score(self.env, fittest, self.test_episodes, key=test_key),
             lambda: state.score,
         )
-        metrics |= bred | {
+        metrics = {
             "fitness_max": jnp.max(rankable(fitness)),
             "fitness_mean": jnp.nanmean(fitness),
             "fitness_nan": jnp.sum(jnp.isnan(fitness)),
@@ -293,7 +259,7 @@ class ERL(eqx.Module):
         return ERLState(
             population,
             lineage,
-            tuple(learners),
+            learners,
             replay,
             ledger,
             allocation,
@@ -302,17 +268,53 @@ class ERL(eqx.Module):
             state.frames + frames,
             state.episodes + episodes,
             generation,
-        ), metrics
+        ), metrics | bred | explored | learned
+
+    def explore(
+        self, state: ERLState, replay: Any, *, key: PRNGKeyArray
+    ) -> tuple[Any, Ledger, tuple[Int[Array, ""], Int[Array, ""]], Metrics]:
+        """Lines 16-20 of Algorithm 10: each learner's workers play an episode with noise.
+
+        **Returns:** the buffer, the ledger, frames and episodes played, and who played how much.
+        """
+        ledger, metrics = state.ledger, {}
+        frames = episodes = jnp.int32(0)
+        for i, learner in enumerate(self.learners):
+            workers = jnp.sum((state.allocation == i).astype(jnp.int32))
+            explorer = learner.explorer(state.learners[i], jnp.bool_(False))
+            played, experience = collect(
+                self.env,
+                tree.stack(explorer),
+                self.workers,
+                wanted=workers,
+                common=False,
+                key=jax.random.fold_in(key, i),
+            )
+            replay = extend(replay, experience.transitions, experience.valid)
+            returns = played.returns[self.signal][0]
+            ledger = observe(self.manager or UCB(), ledger, i, returns, workers)
+            frames, episodes = frames + jnp.sum(played.steps), episodes + workers
+            metrics |= {f"workers_{i}": workers, f"value_{i}": ledger.value[i]}
+        return replay, ledger, (frames, episodes), metrics
+
+    def learn(
+        self, states: tuple[PyTree, ...], replay: Any, updates: Int[Array, ""], *, key: PRNGKeyArray
+    ) -> tuple[tuple[PyTree, ...], Metrics]:
+        """Lines 21-29 of Algorithm 10: `updates` steps of each learner on the common buffer."""
+        learned, metrics = [], {}
+        for i, learner in enumerate(self.learners):
+            step_key = jax.random.fold_in(key, i)
+            state, report = learn(
+                learner, states[i], replay, updates, signal=self.signal, key=step_key
+            )
+            learned.append(state)
+            metrics |= {f"{name}_{i}": value for name, value in report.items()}
+        return tuple(learned), metrics
 
     @property
     def signal(self) -> str:
         """The reward that fitness and, unless they name another, learners optimise."""
         return self.fitness or self.env.signals[0]
-
-    def test(self, champion: AbstractPolicy, *, key: PRNGKeyArray) -> Float[Array, "1 episodes"]:
-        """Returns of the signal that is reported, on fresh episodes."""
-        played = evaluate(self.env, tree.stack(champion), self.test_episodes, key=key)
-        return played.returns[self.env.signals[-1]]
 
 
 @jit
@@ -364,6 +366,18 @@ def breed(
         tree.take(population, champion),
         metrics,
     )
+
+
+@jit
+def inject(
+    population: PyTree, lineage: Lineage, actors: list[AbstractPolicy], sync: Bool[Array, ""]
+) -> tuple[PyTree, Lineage]:
+    """If `sync`, the learners' actors take the last slots, those of the weakest's offspring."""
+    for i, actor in enumerate(actors):
+        slot = tree.size(population) - 1 - i
+        population = tree.where(sync, tree.put(population, slot, actor), population)
+        lineage = tree.where(sync, lineage.inject(slot, i), lineage)
+    return population, lineage
 
 
 @jit

@@ -6,22 +6,21 @@ makes as many updates as frames were played, so that its end is a state to resum
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from .. import require, tree
+from .. import require, rollout, tree
+from ..compilation import when
 from ..learners.base import AbstractLearner, learn
 from ..learners.sac import SAC
-from ..learners.td3 import TD3, ddpg
+from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, ddpg
 from ..networks.base import AbstractNetwork, AbstractPolicy
-from ..networks.mlp import MLP
 from ..replay import Replay, extend
-from ..rollout import Environment, blank, collect, evaluate
+from ..rollout import Environment, blank, collect
 from ..types import Metrics
 
 
@@ -39,7 +38,7 @@ class OffPolicy(eqx.Module):
     default_budget: ClassVar[dict[str, int]] = {"frames": 1_000_000}
 
     env: Environment
-    network: AbstractNetwork = MLP(hidden=(256, 256), activation="relu", initializer="uniform")
+    network: AbstractNetwork = TD3_NETWORK
     learner: AbstractLearner = TD3()
     episodes: int = eqx.field(static=True, default=1)  # played between updates
     start_frames: int = eqx.field(static=True, default=25_000)  # of random actions at first
@@ -58,20 +57,19 @@ class OffPolicy(eqx.Module):
     @classmethod
     def td3(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of TD3's authors, second version."""
-        return cls(env, **_given(network=network) | overrides)
+        return cls(env, network or TD3_NETWORK, **overrides)
 
     @classmethod
     def ddpg(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of ERL's learner (Khadka 2019, section 5.4)."""
-        network = network or MLP(hidden=(128, 128), normalization="before", initializer="uniform")
         settings = {"learner": ddpg(), "start_frames": 1_000}
-        return cls(env, network, **settings | overrides)
+        return cls(env, network or ERL_NETWORK, **settings | overrides)
 
     @classmethod
     def sac(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of SAC's authors, with a learned temperature."""
         settings = {"learner": SAC(), "start_frames": 10_000}
-        return cls(env, **_given(network=network) | settings | overrides)
+        return cls(env, network or TD3_NETWORK, **settings | overrides)
 
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
@@ -120,7 +118,7 @@ class OffPolicy(eqx.Module):
         due = (frames // self.test_every > state.frames // self.test_every) | (state.frames == 0)
         score = when(
             due,
-            lambda: jnp.mean(self.test(actor, key=test_key)),
+            lambda: rollout.score(self.env, actor, self.test_episodes, key=test_key),
             lambda: state.score,
         )
         returns = played.returns[self.learner.signal or signal]
@@ -133,19 +131,3 @@ class OffPolicy(eqx.Module):
         }
         champion = tree.where(due, actor, state.champion)
         return OffPolicyState(learner, replay, champion, score, frames), metrics
-
-    def test(self, actor: AbstractPolicy, *, key: PRNGKeyArray) -> Float[Array, "1 episodes"]:
-        """Returns of the signal that is reported, without noise."""
-        played = evaluate(self.env, tree.stack(actor), self.test_episodes, key=key)
-        return played.returns[self.env.signals[-1]]
-
-
-def when(due: Any, play: Callable, skip: Callable) -> Any:
-    """`play()` if `due`, else `skip()`; as part of a program only where `due` is traced."""
-    if isinstance(due, jax.core.Tracer):
-        return jax.lax.cond(due, play, skip)
-    return play() if due else skip()
-
-
-def _given(**fields) -> dict[str, Any]:
-    return {name: value for name, value in fields.items() if value is not None}

@@ -15,16 +15,15 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from .. import require, tree
-from ..compilation import jit
+from .. import require, rollout, tree
+from ..compilation import jit, when
 from ..learners.base import act, adam, adam_state, require_memoryless
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import Explorer, GaussianNoise
 from ..networks.mlp import MLP, Critic, CriticNetwork
 from ..replay import Replay, extend
-from ..rollout import Environment, blank, collect, evaluate
+from ..rollout import Environment, blank, collect
 from ..types import Metrics, Transition
-from .off_policy import when
 
 
 class Actor(eqx.Module):
@@ -153,7 +152,7 @@ class PPO(eqx.Module):
         due = (frames // self.test_every > state.frames // self.test_every) | (state.frames == 0)
         score = when(
             due,
-            lambda: jnp.mean(self.test(actor.mean, key=test_key)),
+            lambda: rollout.score(self.env, actor.mean, self.test_episodes, key=test_key),
             lambda: state.score,
         )
         returns = played.returns[self.signal or self.env.signals[0]][0]
@@ -171,11 +170,6 @@ class PPO(eqx.Module):
     def warm(self, state: PPOState, policy: AbstractPolicy) -> PPOState:
         """`state` that goes on from a saved policy of the same network."""
         return eqx.tree_at(lambda s: s.actor.mean, state, policy)
-
-    def test(self, actor: AbstractPolicy, *, key: PRNGKeyArray) -> Float[Array, "1 episodes"]:
-        """Returns of the signal that is reported, without noise."""
-        played = evaluate(self.env, tree.stack(actor), self.test_episodes, key=key)
-        return played.returns[self.env.signals[-1]]
 
 
 @jit

@@ -17,9 +17,14 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from .. import require
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import AbstractNoise, Explorer, GaussianNoise, OrnsteinUhlenbeck
-from ..networks.mlp import Critic, CriticNetwork, MLPPolicy
+from ..networks.mlp import MLP, Critic, CriticNetwork, MLPPolicy
 from ..types import Batch, Metrics
 from .base import AbstractLearner, act, adam, adam_state, polyak, require_memoryless
+
+TD3_NETWORK = MLP(hidden=(256, 256), activation="relu", initializer="uniform")
+"""The actor of TD3's authors, second version."""
+ERL_NETWORK = MLP(hidden=(128, 128), normalization="before", initializer="uniform")
+"""The actor of ERL (Khadka 2019, section 5.4)."""
 
 
 class TD3State(eqx.Module):
