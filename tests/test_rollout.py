@@ -233,26 +233,26 @@ def test_a_team_earns_shared_and_private_rewards():
 class Counter(AbstractPolicy):
     """Acts the number of steps so far, over ten."""
 
+    tenth: float = 0.1
+
     def start(self, *, key):
         return jnp.float32(0.0)
 
     def __call__(self, obs, carry):
-        return obs * 0.0 + carry / 10.0, carry + 1.0
+        return obs * 0.0 + carry * self.tenth, carry + 1.0
 
 
 def test_the_carry_lives_for_one_episode():
     env = Copy(max_steps=3)
-    returns, steps = rollout.episode(
-        env, Counter(), world_key=jax.random.key(0), policy_key=jax.random.key(1)
-    )
+    population = tree.stack(Counter(), Counter())
+    played = rollout.evaluate(env, population, 2, key=jax.random.key(0))
     actions, carries = rollout.trace(Counter(), jnp.ones((3, 1)))
     assert actions[:, 0].tolist() == pytest.approx([0.0, 0.1, 0.2])
     assert carries.tolist() == [1.0, 2.0, 3.0]
-    assert int(steps) == 3
-    again, _ = rollout.episode(
-        env, Counter(), world_key=jax.random.key(0), policy_key=jax.random.key(2)
-    )
-    assert float(returns["reward"]) == float(again["reward"]) < 0.0
+    assert played.steps.tolist() == [[3, 3], [3, 3]]
+    returns = played.returns["reward"]
+    assert returns[0].tolist() == returns[1].tolist()  # common worlds, and no carry left over
+    assert float(returns.max()) < 0.0
 
 
 # Transitions: the same episodes as `evaluate`, frame by frame.

@@ -1,6 +1,7 @@
 """Playing episodes: the only place where a policy meets an environment."""
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -40,7 +41,9 @@ def evaluate(
     """
     if isinstance(env, AbstractHostEnvironment):
         return collect(env, population, episodes, common=common, key=key)[0]
-    return _evaluate(env, population, episodes, common=common, key=key)
+    if isinstance(env, AbstractSequenceTask) and getattr(population, "features_first", False):
+        return _answer(env, population, episodes, common, key=key)
+    return _play(env, population, episodes, jnp.int32(episodes), common, False, key=key)[0]
 
 
 def collect(
@@ -61,7 +64,7 @@ def collect(
     wanted = episodes if wanted is None else wanted
     if isinstance(env, AbstractHostEnvironment):
         return _collect_on_host(env, population, episodes, wanted, common, key)
-    return _collect(env, population, episodes, jnp.int32(wanted), common, key=key)
+    return _play(env, population, episodes, jnp.int32(wanted), common, True, key=key)
 
 
 def score(
@@ -95,120 +98,83 @@ def world_keys(pop: int, episodes: int, common: bool, *, key: PRNGKeyArray) -> P
 
 
 @jit
-def _evaluate(
-    env: AbstractEnvironment, population: PyTree, episodes: int, *, common: bool, key: PRNGKeyArray
+def _answer(
+    env: AbstractSequenceTask, population: PyTree, episodes: int, common: bool, *, key: PRNGKeyArray
 ) -> Evaluation:
-    pop = tree.size(population)
-    world_key, policy_key = jax.random.split(key)
-    keys = world_keys(pop, episodes, common, key=world_key)
-    if isinstance(env, AbstractSequenceTask) and getattr(population, "features_first", False):
-        drawn = keys[:1] if common else keys
-        # An episode resets with the first half of its world key: the same sequences either way.
-        sample = jax.vmap(jax.vmap(lambda key: env.sample(key=jax.random.split(key)[0])))
-        sequences = sample(drawn)
-        return play_sequences(env, population, sequences)
-    play = eqx.filter_vmap(
-        eqx.filter_vmap(
-            lambda policy, world, key: episode(env, policy, world_key=world, policy_key=key),
-            in_axes=(None, 0, 0),
-        )
-    )
-    returns, steps = play(population, keys, jax.random.split(policy_key, (pop, episodes)))
-    return Evaluation(returns, steps)
-
-
-def episode(
-    env: AbstractEnvironment,
-    policy: AbstractPolicy,
-    *,
-    world_key: PRNGKeyArray,
-    policy_key: PRNGKeyArray,
-) -> tuple[dict[str, Float[Array, "..."]], Int[Array, ""]]:
-    """Play one episode to its end: the undiscounted return of every signal, and its steps."""
-    reset_key, step_key = jax.random.split(world_key)
-    state, time_step = env.reset(key=reset_key)
-    returns = jax.tree.map(jnp.zeros_like, time_step.rewards)
-    start = (state, time_step, policy.start(key=policy_key), returns, jnp.int32(0))
-
-    def ongoing(loop):
-        _, time_step, _, _, steps = loop
-        ended = time_step.terminated | time_step.truncated
-        return ~ended & (steps < env.max_steps)
-
-    def advance(loop):
-        state, time_step, carry, returns, steps = loop
-        action, carry = policy(time_step.obs, carry)
-        key = jax.random.fold_in(step_key, steps)
-        state, time_step = env.step(state, jnp.clip(action, -1.0, 1.0), key=key)
-        returns = jax.tree.map(jnp.add, returns, time_step.rewards)
-        return state, time_step, carry, returns, steps + 1
-
-    *_, returns, steps = jax.lax.while_loop(ongoing, advance, start)
-    return returns, steps
+    """Sequences are known before anybody acts: they are drawn first and answered together."""
+    world_key, _ = jax.random.split(key)
+    keys = world_keys(1 if common else tree.size(population), episodes, common, key=world_key)
+    # An episode resets with the first half of its world key: the same sequences either way.
+    sequences = _each(lambda key: env.sample(key=jax.random.split(key)[0]))(keys)
+    return play_sequences(env, population, sequences)
 
 
 @jit
-def _collect(
+def _play(
     env: AbstractEnvironment,
     population: PyTree,
     episodes: int,
     wanted: Int[Array, ""],
     common: bool,
+    record: bool,
     *,
     key: PRNGKeyArray,
-) -> tuple[Evaluation, Experience]:
+) -> tuple[Evaluation, Any]:
     """All lanes `[pop, episodes]` take each step together, so that a row of the buffer is written
-    in place; a `vmap` of whole episodes would copy the buffer at every step."""
+    in place; a `vmap` of whole episodes would copy the buffer at every step. `record`: the second
+    result is the `Experience`, not None."""
     pop = tree.size(population)
+    lanes = (pop, episodes)
     world_key, policy_key = jax.random.split(key)
     worlds = world_keys(pop, episodes, common, key=world_key)
     reset_keys, step_keys = jnp.moveaxis(_each(jax.random.split)(worlds), 2, 0)
-    policy_keys = jax.random.split(policy_key, (pop, episodes))
-
     states, first = _each(lambda key: env.reset(key=key))(reset_keys)
-    carries = _start(population, policy_keys)
-    active = jnp.broadcast_to(jnp.arange(episodes) < wanted, (pop, episodes))
-    shape = (env.max_steps, pop, episodes)
-    buffer = jax.tree.map(lambda x: jnp.zeros((*shape, *x.shape), x.dtype), blank(env))
-    valid = jnp.zeros(shape, bool)
-    lost = jnp.zeros_like(active)  # as on the host: NaN in the buffer would spoil every learner
-    start = (jnp.int32(0), states, first.obs, carries, active, lost, buffer, valid)
+    carries = _start(population, jax.random.split(policy_key, lanes))
+    active = jnp.broadcast_to(jnp.arange(episodes) < wanted, lanes)
+    lost = jnp.zeros_like(active)  # who said NaN goes on with 0, and has a return of NaN
+    totals = (jax.tree.map(jnp.zeros_like, first.rewards), jnp.zeros(lanes, jnp.int32), lost)
+    rows = None
+    if record:
+        row = (blank(env), jnp.bool_(False))
+        rows = jax.tree.map(lambda x: jnp.zeros((env.max_steps, *lanes, *x.shape), x.dtype), row)
+    start = (jnp.int32(0), states, first.obs, carries, active, totals, rows)
 
     def ongoing(loop):
-        t, *_, active, _, _, _ = loop
+        t, _, _, _, active, _, _ = loop
         return jnp.any(active) & (t < env.max_steps)
 
     def advance(loop):
-        t, states, obs, carries, active, lost, buffer, valid = loop
+        t, states, obs, carries, active, (returns, steps, lost), rows = loop
         actions, carries = _act(population, obs, carries)
         nan = ~jnp.isfinite(actions)
-        lost = lost | (active & jnp.any(nan.reshape(*lost.shape, -1), axis=2))
+        lost = lost | (active & jnp.any(nan.reshape(*lanes, -1), axis=2))
         actions = jnp.where(nan, 0.0, actions)
         keys = _each(lambda key: jax.random.fold_in(key, t))(step_keys)
         bounded = jnp.clip(actions, -1.0, 1.0)
         states, step = _each(lambda s, a, key: env.step(s, a, key=key))(states, bounded, keys)
-        ends = (step.terminated, step.truncated)
-        row = Transition(obs, actions, step.rewards, step.obs, *ends)
-        buffer = jax.tree.map(lambda xs, x: xs.at[t].set(x), buffer, row)
-        valid = valid.at[t].set(active)
+        returns = jax.tree.map(
+            lambda sum_, x: sum_ + jnp.where(_over(active, x), x, 0.0), returns, step.rewards
+        )
+        steps = steps + active.astype(jnp.int32)
+        if record:
+            ends = (step.terminated, step.truncated)
+            row = (Transition(obs, actions, step.rewards, step.obs, *ends), active)
+            rows = jax.tree.map(lambda xs, x: xs.at[t].set(x), rows, row)
         active = active & ~(step.terminated | step.truncated)
-        return t + 1, states, step.obs, carries, active, lost, buffer, valid
+        return t + 1, states, step.obs, carries, active, (returns, steps, lost), rows
 
-    *_, lost, buffer, valid = jax.lax.while_loop(ongoing, advance, start)
+    *_, (returns, steps, lost), rows = jax.lax.while_loop(ongoing, advance, start)
+    returns = jax.tree.map(lambda x: jnp.where(_over(lost, x), jnp.nan, x), returns)
+    if record:
+        # Episode by episode, as they would be met one after the other.
+        flat = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2).reshape(-1, *x.shape[3:]), rows)
+        return Evaluation(returns, steps), Experience(*flat)
+    return Evaluation(returns, steps), None
 
-    def total(reward):
-        team = (1,) * (reward.ndim - valid.ndim)
-        played = valid.reshape(valid.shape + team)
-        sum_ = jnp.sum(jnp.where(played, reward, jnp.zeros_like(reward)), axis=0)
-        return jnp.where(lost.reshape(lost.shape + team), jnp.nan, sum_)
 
-    steps = jnp.sum(valid.astype(jnp.int32), axis=0)
-    returns = jax.tree.map(total, buffer.rewards)
-
-    def flat(x):
-        return jnp.moveaxis(x, 0, 2).reshape(-1, *x.shape[3:])
-
-    return Evaluation(returns, steps), Experience(jax.tree.map(flat, buffer), flat(valid))
+def _over(lanes: Bool[Array, "pop episodes"], x: Array) -> Bool[Array, "..."]:
+    """`lanes` for `x` that may have an axis of agents behind."""
+    return lanes.reshape(lanes.shape + (1,) * (x.ndim - lanes.ndim))
 
 
 def _collect_on_host(
@@ -228,9 +194,7 @@ def _collect_on_host(
     seeds, carry = start(arrays, (pop, episodes), common, key)
     copies = env.copies(pop * episodes)
     active = np.tile(np.arange(episodes) < int(wanted), pop)
-    lost = np.zeros_like(
-        active
-    )  # the policy said NaN or infinity: it goes on with 0 and its return is NaN
+    lost = np.zeros_like(active)  # as in `_play`
     obs = copies.reset(np.asarray(seeds).reshape(-1), active)
     rows, played = [], []
     for _ in range(env.max_steps):

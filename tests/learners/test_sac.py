@@ -1,6 +1,7 @@
 """SAC: densities and updates as in a NumPy version of the published box."""
 
 import copy
+import dataclasses
 
 import equinox as eqx
 import jax
@@ -217,6 +218,18 @@ def test_each_step_draws_anew(start):
 def test_networks_without_a_mean_to_squash_are_refused(network):
     with pytest.raises(TypeError, match="SAC needs an MLP with a tanh output"):
         SAC().init(network, OBS, ACT, key=jax.random.key(0))
+
+
+def test_a_reward_scale_is_that_of_the_rewards(start):
+    batch = batch_of(0)
+    smaller = eqx.tree_at(lambda b: b.reward, batch, np.float32(0.5) * batch.reward)
+    halving = dataclasses.replace(LEARNER, reward_scale=0.5)
+    a, b = (
+        update(learner, start, rows, jax.random.key(0))[0].critics
+        for learner, rows in ((halving, batch), (LEARNER, smaller))
+    )
+    assert same(a, b)
+    assert not same(a, update(LEARNER, start, batch, jax.random.key(0))[0].critics)
 
 
 @pytest.mark.parametrize("field", ["gamma", "tau", "alpha_lr", "critics"])

@@ -301,6 +301,18 @@ def test_a_time_limit_may_count_as_the_end():
     assert np.any(np.asarray(through) != batch.reward)
 
 
+def test_a_reward_scale_is_that_of_the_rewards():
+    batch, state = batch_of(0), start("td3")
+    smaller = eqx.tree_at(lambda b: b.reward, batch, np.float32(0.5) * batch.reward)
+    halving = dataclasses.replace(LEARNERS["td3"], reward_scale=0.5)
+    target = bellman_target(halving, state, batch, jax.random.key(0))
+    other = bellman_target(LEARNERS["td3"], state, smaller, jax.random.key(0))
+    np.testing.assert_array_equal(target, other)
+    assert np.any(
+        np.asarray(target) != bellman_target(LEARNERS["td3"], state, batch, jax.random.key(0))
+    )
+
+
 def test_the_actor_of_a_learner_may_start_small():
     learner = dataclasses.replace(LEARNERS["ddpg"], actor_scale=0.1)
     full, small = (

@@ -291,8 +291,8 @@ class ERL(eqx.Module):
                 key=jax.random.fold_in(key, i),
             )
             replay = extend(replay, experience.transitions, experience.valid)
-            returns = played.returns[self.signal][0]
-            ledger = observe(self.manager or UCB(), ledger, i, returns, workers)
+            returns, theirs = played.returns[self.signal][0], jnp.arange(self.workers) < workers
+            ledger = (self.manager or UCB()).observe(ledger, i, returns, theirs)
             frames, episodes = frames + jnp.sum(played.steps), episodes + workers
             metrics |= {f"workers_{i}": workers, f"value_{i}": ledger.value[i]}
         return replay, ledger, (frames, episodes), metrics
@@ -378,18 +378,6 @@ def inject(
         population = tree.where(sync, tree.put(population, slot, actor), population)
         lineage = tree.where(sync, lineage.inject(slot, i), lineage)
     return population, lineage
-
-
-@jit
-def observe(
-    manager: AbstractManager,
-    ledger: Ledger,
-    i: int,
-    returns: Float[Array, " b"],
-    played: Int[Array, ""],
-) -> Ledger:
-    """The ledger with the first `played` returns of learner `i`."""
-    return manager.observe(ledger, i, returns, jnp.arange(returns.shape[0]) < played)
 
 
 def share_of(child: PyTree, mate: PyTree, survivor: PyTree) -> Float[Array, ""]:

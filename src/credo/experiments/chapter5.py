@@ -48,7 +48,7 @@ PLANS = {
     "published": Plan(2_000_000, 5),
 }
 PLANS_OF_TASKS = {
-    ("full", "Swimmer-v5"): Plan(500_000, 3, 0.25),
+    ("full", "Swimmer-v5"): Plan(500_000, 3, 0.1),
     ("full", "Humanoid-v5"): Plan(100_000, 2),
     # Hopper has 4M in chapter 5, and 5M and 1.5M in chapter 6: runs of 5M hold them all.
     ("published", "Hopper-v5"): Plan(5_000_000, 5),

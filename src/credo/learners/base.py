@@ -82,19 +82,15 @@ def _learn(
 ) -> tuple[PyTree, Metrics]:
     dynamic, static = eqx.partition(state, eqx.is_array)
 
-    def one(dynamic, i):
+    def body(i, loop):
+        dynamic, total = loop
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
         rows = replay.sample(learner.batch_size, key=sample_key)
         reward = rows.rewards[signal]
         ends = (rows.terminated, rows.truncated)
         batch = Batch(rows.obs, rows.action, reward, rows.next_obs, *ends)
         state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)
-        return eqx.filter(state, eqx.is_array), metrics
-
-    def body(i, loop):
-        dynamic, total = loop
-        dynamic, metrics = one(dynamic, i)
-        return dynamic, jax.tree.map(jnp.add, total, metrics)
+        return eqx.filter(state, eqx.is_array), jax.tree.map(jnp.add, total, metrics)
 
     zeros = {name: jnp.float32(0.0) for name in learner.metrics}
     dynamic, total = jax.lax.fori_loop(0, updates, body, (dynamic, zeros))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .. import require
+from ..compilation import jit
 
 
 class Ledger(eqx.Module):
@@ -37,6 +38,7 @@ class AbstractManager(eqx.Module):
 
     memory: eqx.AbstractVar[float]  # α: weight of the newest return, in (0, 1]
 
+    @jit
     def observe(
         self, ledger: Ledger, i: int, returns: Float[Array, " n"], played: Bool[Array, " n"]
     ) -> Ledger:

@@ -82,6 +82,7 @@ class SAC(AbstractLearner):
     alpha_lr: float = 3e-4
     tau: float = 5e-3  # share of the new weights in the targets
     target_entropy: float = -1.0  # nats per action dimension
+    reward_scale: float = 1.0  # critics see rewards times this
     critics: int = eqx.field(static=True, default=2)  # the least of them is believed
     batch_size: int = eqx.field(static=True, default=256)
     signal: str | None = eqx.field(static=True, default=None)
@@ -144,7 +145,8 @@ class SAC(AbstractLearner):
         obs = batch.next_obs.T
         action, log_p = state.actor.sample(obs, key=key)
         q = jnp.min(jnp.stack([critic(obs, action) for critic in state.target_critics]), axis=0)
-        return batch.reward + self.gamma * jnp.where(batch.terminated, 0.0, q - alpha * log_p)
+        reward = self.reward_scale * batch.reward
+        return reward + self.gamma * jnp.where(batch.terminated, 0.0, q - alpha * log_p)
 
     def actor(self, state: SACState) -> AbstractPolicy:
         return state.actor.mean

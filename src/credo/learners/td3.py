@@ -57,6 +57,7 @@ class TD3(AbstractLearner):
     actor_scale: float = 1.0  # of the fresh actor's output layer
     bootstrap_truncated: bool = eqx.field(static=True, default=True)
     """A time limit is not the end of the task; False: it counts as one, as in the author's code."""
+    reward_scale: float = 1.0  # critics see rewards times this: values of thousands come slowly
     batch_size: int = eqx.field(static=True, default=256)
     signal: str | None = eqx.field(static=True, default=None)
 
@@ -132,7 +133,8 @@ class TD3(AbstractLearner):
         ended = batch.terminated
         if not self.bootstrap_truncated:
             ended = ended | batch.truncated
-        return batch.reward + self.gamma * jnp.where(ended, 0.0, q)
+        reward = self.reward_scale * batch.reward
+        return reward + self.gamma * jnp.where(ended, 0.0, q)
 
     def actor(self, state: TD3State) -> AbstractPolicy:
         return state.actor

@@ -42,9 +42,7 @@ class MLP(AbstractNetwork):
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> "MLPPolicy":
         sizes = (obs_size, *self.hidden, action_size)
         weights = draw_layers(sizes, self.initializer, self.normalization, key=key)
-        for name in (f"W_{len(self.hidden)}", f"b_{len(self.hidden)}"):
-            weights[name] = self.output_scale * weights[name]
-        return MLPPolicy(weights, self)
+        return MLPPolicy(weights, self).scaled(self.output_scale)
 
 
 class MLPPolicy(AbstractPolicy):
