@@ -83,6 +83,7 @@ EXPERIMENTS = {
     "fig-3.10": "recall in corridors of 1..101 steps",
     "ablation-3.4a": "our settings less one ingredient, 21-deep",
     "check-td3": "TD3 alone, against its authors",
+    "check-learners": "DDPG, SAC and TD3 alone, on cheap tasks",
     "fig-5.2": "standard and hard inverted double pendulum",
     "fig-5.3": "ERL against its parts on six tasks",
     "fig-5.4": "ERL without selection",

@@ -126,7 +126,7 @@ def test_portfolios_differ_in_what_the_figures_say():
     cell = cell_named("cerl Swimmer-v5")
     assert [learner.gamma for learner in cell.algorithm.learners] == [0.9, 0.99, 0.997, 0.9995]
     assert cell.algorithm.manager == UCB(exploration=0.9)
-    assert cell.algorithm.updates_per_frame == 0.25
+    assert cell.algorithm.updates_per_frame == 0.1
     extreme = cell_named("cerl gamma 0 1 Hopper-v5").algorithm
     assert [learner.gamma for learner in extreme.learners] == [0.0, 1.0]
     assert cell_named("cerl c 5 Humanoid-v5").algorithm.manager.exploration == 5.0

@@ -27,6 +27,7 @@ MODULES = {
     "fig-3.10": "fig_3_10",
     "ablation-3.4a": "ablation_3_4a",
     "check-td3": "check_td3",
+    "check-learners": "check_learners",
     "fig-5.2": "fig_5_2",
     "fig-5.3": "fig_5_3",
     "fig-5.4": "fig_5_4",

@@ -96,6 +96,7 @@ VERSIONS = {
     "Ant": "no bonus is paid for the step of a fall, contact forces are observed and always cost",
     "Hopper": "no bonus is paid for the step of a fall",
     "Walker2d": "no bonus is paid for the step of a fall, and both feet have the same friction",
+    "Pendulum": "the published numbers are of the same version",
     "InvertedPendulum": "nothing is paid for the step of the fall",
     "InvertedDoublePendulum": "no bonus is paid for the step of the fall, and two numbers of the "
     "observation that were always 0 are gone",

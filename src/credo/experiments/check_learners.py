@@ -1,0 +1,91 @@
+"""Check of the other learners: DDPG and SAC alone (and TD3 beside them) on two cheap tasks."""
+
+import dataclasses
+from typing import Any
+
+from ..algorithms.off_policy import OffPolicy
+from ..learners.base import AbstractLearner
+from ..learners.sac import SAC
+from ..learners.td3 import TD3, TD3_NETWORK, ddpg
+from ..networks.exploration import GaussianNoise
+from ..networks.mlp import MLP, Critic
+from ..runs.loop import Run
+from ..runs.page import Reference
+from . import chapter5
+from .base import Cell
+from .chapter5 import Plan
+
+TITLE = "DDPG, SAC and TD3 alone, on cheap tasks"
+PUBLISHED = (
+    "Not in the dissertation. The benchmark of RL Baselines3 Zoo has, for Pendulum-v1 at 20,000 "
+    "frames (one agent each, mean ± deviation of 750 episodes): DDPG -152.1 ± 94.3, SAC "
+    "-157.0 ± 88.7, TD3 -151.9 ± 90.2. The settings here are theirs. InvertedPendulum pays 1 per "
+    "step: 1,000 is all there is."
+)
+BUDGETS = ("smoke", "quick", "full", "published")
+SWING, BALANCE = "Pendulum-v1", "InvertedPendulum-v5"
+ZOO = {"ddpg": (-152.099, 94.282), "sac": (-156.995, 88.714), "td3": (-151.855, 90.227)}
+PLANS = {  # frames of either task, and runs
+    "smoke": (600, 600, 2),
+    "quick": (10_000, 10_000, 2),
+    "full": (20_000, 30_000, 3),
+    "published": (20_000, 30_000, 10),
+}
+LARGE = Critic(hidden=(400, 300))
+FAST: dict[str, Any] = {"gamma": 0.98, "actor_lr": 1e-3, "critic_lr": 1e-3}
+
+
+def learners() -> dict[str, tuple[AbstractLearner, MLP, int]]:
+    """Learner, network and random frames at the start, as the Zoo has them for Pendulum-v1."""
+    large = dataclasses.replace(TD3_NETWORK, hidden=(400, 300))
+    alike: dict[str, Any] = FAST | {"critic": LARGE, "noise": GaussianNoise(0.1)}
+    unclipped = {"tau": 5e-3, "actor_max_norm": None, "critic_max_norm": None, "actor_scale": 1.0}
+    return {
+        "ddpg": (ddpg(**alike, **unclipped, batch_size=256), large, 10_000),
+        "sac": (SAC(actor_lr=1e-3, critic_lr=1e-3, alpha_lr=1e-3), TD3_NETWORK, 100),
+        "td3": (TD3(**alike), large, 10_000),
+    }
+
+
+def cells(budget: str) -> list[Cell]:
+    swing, balance, runs = PLANS[budget]
+    found = []
+    for label, (learner, network, start) in learners().items():
+        for task, frames in ((SWING, swing), (BALANCE, balance)):
+            made = chapter5.cell(
+                f"{label} alone",  # the same learners have other settings elsewhere
+                OffPolicy.td3,
+                task,
+                budget,
+                planned=Plan(frames, runs),
+                network=network,
+                learner=learner,
+                start_frames=start if task == SWING else 1_000,
+                test_every=1_000,
+            )
+            found.append(made)
+    return found
+
+
+def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
+    return {name: chapter5.outcome(name, cell) for name, cell in runs.items()}
+
+
+def sections(measured: dict[str, Any]) -> list[Any]:
+    given = {}
+    for name, cell in measured.items():
+        if cell["task"] == SWING:
+            mean, deviation = ZOO[cell["label"].split()[0]]
+            given[name] = f"{mean:.1f} ± {deviation:.1f}"
+    levels = {
+        SWING: [Reference(f"{label}, Zoo", mean) for label, (mean, _) in ZOO.items()],
+        BALANCE: [Reference("ceiling", 1000.0)],
+    }
+    return [
+        *(
+            chapter5.curves(task, chapter5.of_task(measured, task), *levels[task])
+            for task in chapter5.tasks_in(measured)
+        ),
+        chapter5.scores(measured, given, reference={}, caption="Published: the Zoo, per episode."),
+        chapter5.about(measured),
+    ]
