@@ -95,7 +95,7 @@ EXPERIMENTS = {
     "fig-6.4": "exploration of the resource manager",
     "fig-6.5": "CERL against its parts on four tasks",
     "table-6.1": "workers of each learner",
-    "beyond-6": "SAC beside TD3, and three managers",
+    "beyond-6": "SAC and a critic of 2024 beside TD3, and three managers",
 }
 PRESETS = {
     "as-written": "Algorithm 2 as printed (the default)",

@@ -6,7 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from credo.networks.mlp import MLP, Critic, draw_layers
+from credo.compilation import jit
+from credo.learners.sac import SAC
+from credo.learners.td3 import TD3
+from credo.networks.mlp import MLP, Critic, ResidualCritic, draw_layers
+from credo.types import Batch
 
 OBS, ACT, N = 3, 2, 7
 KEY = jax.random.key(0)
@@ -146,3 +150,38 @@ def test_normalized_layers_do_not_feel_the_size_of_their_inputs(inputs):
 def test_impossible_networks_are_refused(build, told):
     with pytest.raises(ValueError, match=told):
         build()
+
+
+def test_a_residual_critic_follows_the_equations(inputs):
+    config = ResidualCritic(width=5, blocks=2)
+    critic = shaken(config.init(OBS, ACT, key=KEY))
+    w = {name: np.asarray(value, np.float64) for name, value in critic.weights.items()}
+    assert {name: x.shape for name, x in w.items() if name[0] == "W"} == {
+        "W_0": (5, OBS + ACT),
+        **{f"W_{i}": (5, 5) for i in range(1, 5)},
+        "W_5": (1, 5),
+    }
+
+    def dense(i, x):
+        x = w[f"W_{i}"] @ x + w[f"b_{i}"]
+        return w[f"g_{i}"] * (x - x.mean()) / np.sqrt(x.var() + 1e-6) + w[f"s_{i}"]
+
+    values = np.asarray(critic(*(jnp.asarray(x.T) for x in inputs)))
+    for i, x in enumerate(np.concatenate(inputs, axis=1)):
+        h = np.maximum(dense(0, x), 0)
+        h = h + dense(2, np.maximum(dense(1, h), 0))
+        h = h + dense(4, np.maximum(dense(3, h), 0))
+        np.testing.assert_allclose(values[i], (w["W_5"] @ h + w["b_5"])[0], atol=1e-5)
+    assert critic.action_size == ACT
+
+
+def test_td3_and_sac_learn_with_a_residual_critic(inputs):
+    obs, action = (x.astype(np.float32) for x in inputs)
+    batch = Batch(obs, action, obs[:, 0], obs, obs[:, 1] > 9, obs[:, 1] > 9)
+    for learner in (TD3(critic=ResidualCritic(width=8)), SAC(critic=ResidualCritic(width=8))):
+        state = learner.init(MLP(hidden=(4,)), OBS, ACT, key=KEY)
+        losses = []
+        for i in range(30):
+            state, metrics = jit(learner.update)(state, batch, key=jax.random.key(i))
+            losses.append(float(metrics["critic_loss"]))
+        assert losses[-1] < 0.9 * losses[0]

@@ -17,7 +17,7 @@ from ..environments.gymnasium import Gymnasium
 from ..environments.wrappers import DelayedHostReward
 from ..environments.wrappers import delayed as with_delay
 from ..networks.exploration import Explorer, GaussianNoise
-from ..networks.mlp import MLP
+from ..networks.mlp import MLP, ResidualCritic
 from ..rollout import evaluate
 from ..runs.loop import Run
 from ..runs.page import Curve, Figure, Reference, Table, Text
@@ -185,8 +185,11 @@ def shrunk(algorithm: Any) -> Any:
 
 
 def _small(learner: Any) -> Any:
-    branches = (4, 4) if learner.critic.branches else ()
-    critic = dataclasses.replace(learner.critic, hidden=(8,), branches=branches)
+    if isinstance(learner.critic, ResidualCritic):
+        critic = dataclasses.replace(learner.critic, width=8)
+    else:
+        branches = (4, 4) if learner.critic.branches else ()
+        critic = dataclasses.replace(learner.critic, hidden=(8,), branches=branches)
     return dataclasses.replace(learner, critic=critic, batch_size=16)
 
 

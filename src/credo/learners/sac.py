@@ -15,7 +15,15 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .. import require
 from ..networks.base import AbstractNetwork, AbstractPolicy
-from ..networks.mlp import MLP, Critic, CriticNetwork, MLPPolicy, draw_layers, linear
+from ..networks.mlp import (
+    MLP,
+    AbstractCritic,
+    AbstractCriticNetwork,
+    Critic,
+    MLPPolicy,
+    draw_layers,
+    linear,
+)
 from ..types import Batch, Metrics
 from .base import AbstractLearner, adam, adam_state, polyak
 
@@ -62,8 +70,8 @@ class Sampler(AbstractPolicy):
 
 class SACState(eqx.Module):
     actor: StochasticActor
-    critics: tuple[CriticNetwork, ...]
-    target_critics: tuple[CriticNetwork, ...]
+    critics: tuple[AbstractCriticNetwork, ...]
+    target_critics: tuple[AbstractCriticNetwork, ...]
     log_alpha: Float[Array, ""]
     actor_opt: optax.OptState
     critic_opt: optax.OptState
@@ -75,7 +83,7 @@ class SAC(AbstractLearner):
 
     metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "actor_loss", "alpha")
 
-    critic: Critic = Critic()
+    critic: AbstractCritic = Critic()
     gamma: float = 0.99  # discount per step, in [0, 1]
     actor_lr: float = 3e-4  # of Adam
     critic_lr: float = 3e-4
@@ -159,7 +167,7 @@ class SAC(AbstractLearner):
 
 
 def soft_critic_error(
-    critics: tuple[CriticNetwork, ...], batch: Batch, target: Float[Array, " batch"]
+    critics: tuple[AbstractCriticNetwork, ...], batch: Batch, target: Float[Array, " batch"]
 ) -> Float[Array, ""]:
     """Half the sum over critics of the mean squared Bellman error."""
     qs = jnp.stack([critic(batch.obs.T, batch.action.T) for critic in critics])
@@ -168,7 +176,7 @@ def soft_critic_error(
 
 def soft_actor_loss(
     actor: StochasticActor,
-    critics: tuple[CriticNetwork, ...],
+    critics: tuple[AbstractCriticNetwork, ...],
     batch: Batch,
     alpha: Float[Array, ""],
     *,

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from .. import require
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import AbstractNoise, Explorer, GaussianNoise, OrnsteinUhlenbeck
-from ..networks.mlp import MLP, Critic, CriticNetwork, MLPPolicy
+from ..networks.mlp import MLP, AbstractCritic, AbstractCriticNetwork, Critic, MLPPolicy
 from ..types import Batch, Metrics
 from .base import AbstractLearner, act, adam, adam_state, polyak, require_memoryless
 
@@ -29,9 +29,9 @@ ERL_NETWORK = MLP(hidden=(128, 128), normalization="before", initializer="unifor
 
 class TD3State(eqx.Module):
     actor: AbstractPolicy
-    critics: tuple[CriticNetwork, ...]
+    critics: tuple[AbstractCriticNetwork, ...]
     target_actor: AbstractPolicy
-    target_critics: tuple[CriticNetwork, ...]
+    target_critics: tuple[AbstractCriticNetwork, ...]
     actor_opt: optax.OptState
     critic_opt: optax.OptState
     step: Int[Array, ""]
@@ -42,7 +42,7 @@ class TD3(AbstractLearner):
 
     metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "q")
 
-    critic: Critic = Critic()
+    critic: AbstractCritic = Critic()
     gamma: float = 0.99  # discount per step, in [0, 1]
     actor_lr: float = 3e-4  # of Adam
     critic_lr: float = 3e-4
@@ -173,13 +173,15 @@ def ddpg(**fields) -> TD3:
 
 
 def critic_error(
-    critics: tuple[CriticNetwork, ...], batch: Batch, target: Float[Array, " batch"]
+    critics: tuple[AbstractCriticNetwork, ...], batch: Batch, target: Float[Array, " batch"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Sum over critics of the mean squared Bellman error, and their mean value."""
     qs = jnp.stack([critic(batch.obs.T, batch.action.T) for critic in critics])
     return jnp.sum(jnp.mean(jnp.square(qs - target[None]), axis=1)), jnp.mean(qs)
 
 
-def actor_loss(actor: AbstractPolicy, critic: CriticNetwork, batch: Batch) -> Float[Array, ""]:
+def actor_loss(
+    actor: AbstractPolicy, critic: AbstractCriticNetwork, batch: Batch
+) -> Float[Array, ""]:
     """Minus the value of what the actor would do (deterministic policy gradient)."""
     return -jnp.mean(critic(batch.obs.T, act(actor, batch.obs).T))

@@ -1,5 +1,6 @@
 """Feed-forward networks: the actor of learners, and the memoryless baseline of evolution."""
 
+import abc
 import itertools
 from typing import ClassVar, Literal
 
@@ -71,9 +72,7 @@ class MLPPolicy(AbstractPolicy):
 
     def scaled(self, factor: Float[Array, ""] | float) -> "MLPPolicy":
         """With the output layer's weights times `factor`."""
-        last = len(self.config.hidden)
-        changed = {name: factor * self.weights[name] for name in (f"W_{last}", f"b_{last}")}
-        return MLPPolicy(self.weights | changed, self.config)
+        return MLPPolicy(scaled(self.weights, len(self.config.hidden), factor), self.config)
 
     def action(self, output: Float[Array, "act *batch"]) -> Float[Array, "act *batch"]:
         """The output, before its activation, as an action in [-1, 1]."""
@@ -81,8 +80,28 @@ class MLPPolicy(AbstractPolicy):
         return to_action(ACTIVATIONS[kind](output), kind)
 
 
-class Critic(eqx.Module):
+class AbstractCritic(eqx.Module):
     """Config of an action-value network Q(s, a)."""
+
+    @abc.abstractmethod
+    def init(
+        self, obs_size: int, action_size: int, *, key: PRNGKeyArray
+    ) -> "AbstractCriticNetwork":
+        """A network with fresh weights."""
+
+
+class AbstractCriticNetwork(eqx.Module):
+    action_size: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def __call__(
+        self, obs: Float[Array, "obs *batch"], action: Float[Array, "act *batch"]
+    ) -> Float[Array, "*batch"]:
+        """Q(s, a)."""
+
+
+class Critic(AbstractCritic):
+    """A multi-layer perceptron."""
 
     hidden: tuple[int, ...] = eqx.field(static=True, default=(256, 256))  # units of each layer
     branches: tuple[int, ...] = eqx.field(static=True, default=())
@@ -109,12 +128,11 @@ class Critic(eqx.Module):
                 weights |= {f"{kind}_{name}": layer[f"{kind}_0"] for kind in "Wb"}
         sizes = (inputs, *self.hidden, 1)
         weights |= draw_layers(sizes, self.initializer, self.normalization, key=layers_key)
-        for name in (f"W_{len(self.hidden)}", f"b_{len(self.hidden)}"):
-            weights[name] = self.output_scale * weights[name]
-        return CriticNetwork(weights, self, action_size)
+        weights = scaled(weights, len(self.hidden), self.output_scale)
+        return CriticNetwork(weights=weights, config=self, action_size=action_size)
 
 
-class CriticNetwork(eqx.Module):
+class CriticNetwork(AbstractCriticNetwork):
     """Weights by name as in `MLPPolicy`; `W_S`, `b_S` and `W_A`, `b_A` of the branches."""
 
     weights: dict[str, Float[Array, "..."]]
@@ -133,6 +151,41 @@ class CriticNetwork(eqx.Module):
         x = jnp.concatenate([obs, action])
         x = hidden_layers(self.weights, x, len(c.hidden), c.activation, c.normalization)
         return linear(self.weights, len(c.hidden), x)[0]
+
+
+class ResidualCritic(AbstractCritic):
+    """BroNet: residual blocks, LayerNorm behind every layer (Nauman et al. 2024, "Bigger,
+    Regularized, Optimistic", section 3). Its other parts (optimism, quantiles, resets, decay of
+    weights) are left out."""
+
+    width: int = eqx.field(static=True, default=256)  # units of every layer
+    blocks: int = eqx.field(static=True, default=2)
+
+    def __check_init__(self):
+        require.at_least("width", self.width, 1)
+        require.at_least("blocks", self.blocks, 0)
+
+    def init(self, obs_size, action_size, *, key):
+        sizes = (obs_size + action_size, *(self.width,) * (1 + 2 * self.blocks), 1)
+        weights = draw_layers(sizes, "uniform", "before", key=key)
+        return ResidualCriticNetwork(weights=weights, action_size=action_size)
+
+
+class ResidualCriticNetwork(AbstractCriticNetwork):
+    """Weights by name as in `MLPPolicy`; of block b the layers 2b + 1 and 2b + 2."""
+
+    weights: dict[str, Float[Array, "..."]]
+    action_size: int = eqx.field(static=True)
+
+    def __call__(self, obs, action):
+        def layer(i, x):
+            return normalize(self.weights, i, linear(self.weights, i, x))
+
+        last = sum(name.startswith("W_") for name in self.weights) - 1
+        x = jax.nn.relu(layer(0, jnp.concatenate([obs, action])))
+        for i in range(1, last, 2):
+            x = x + layer(i + 1, jax.nn.relu(layer(i, x)))
+        return linear(self.weights, last, x)[0]
 
 
 def draw_layers(
@@ -167,6 +220,11 @@ def hidden_layers(weights, x: Array, depth: int, activation: str, normalization:
         if normalization == "after":
             x = normalize(weights, layer, x)
     return x
+
+
+def scaled(weights, layer: int, factor: Float[Array, ""] | float) -> dict[str, Array]:
+    """With one layer's weights times `factor`."""
+    return weights | {name: factor * weights[name] for name in (f"W_{layer}", f"b_{layer}")}
 
 
 def linear(weights, layer: int | str, x: Float[Array, "in *batch"]) -> Float[Array, "out *batch"]:

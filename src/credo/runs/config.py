@@ -31,6 +31,7 @@ from ..learners.base import AbstractLearner
 from ..learners.manager import AbstractManager
 from ..networks.base import AbstractNetwork
 from ..networks.exploration import AbstractNoise
+from ..networks.mlp import AbstractCritic
 
 EXTENSIONS = (
     AbstractEnvironment,
@@ -42,6 +43,7 @@ EXTENSIONS = (
     AbstractLearner,
     AbstractManager,
     AbstractNoise,
+    AbstractCritic,
 )
 PACKAGES = ("credo", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
 
