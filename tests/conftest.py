@@ -6,6 +6,7 @@ os.environ.setdefault(
 )
 
 import jax
+import pytest
 
 from credo import compilation
 
@@ -13,3 +14,10 @@ compilation.enable_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """Compiled programs of all modules would fill gigabytes."""
+    yield
+    jax.clear_caches()

@@ -2,12 +2,16 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
 
+from credo import tree
 from credo.algorithms.neuroevolution import Neuroevolution
+from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
+from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.runs import config, evaluation, log, report
 from credo.runs.loop import Run, RunError, train
@@ -146,3 +150,19 @@ def test_deep_sequences_are_streamed(run):
     assert lines[0] == f"{run.path}: 20 streams of 1,001 signals"
     assert len(lines) == 3
     assert json.loads(lines[1].split()[-1]) in [i / 20 for i in range(21)]
+
+
+def test_many_episodes_outside_jax_are_played_in_turn(monkeypatch):
+    """A simulator for each of a thousand episodes would fill the memory."""
+    asked = []
+    copies = Gymnasium.copies
+    monkeypatch.setattr(Gymnasium, "copies", lambda self, n: asked.append(n) or copies(self, n))
+    task = Gymnasium("InvertedPendulum-v5", in_process=True)
+    policies = tree.stack(MLP(hidden=()).init(4, 1, key=jax.random.key(0)))
+    played = evaluation.in_turn(task, policies, 45, key=jax.random.key(1))
+    assert asked == [20, 20, 20]
+    assert played.steps.shape == played.returns["reward"].shape == (1, 45)
+    returns = np.asarray(played.returns["reward"])
+    assert not np.array_equal(returns[:, :20], returns[:, 20:40])
+    again = evaluation.in_turn(task, policies, 30, key=jax.random.key(1))
+    np.testing.assert_array_equal(again.returns["reward"], played.returns["reward"][:, :30])

@@ -4,17 +4,31 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
 from .. import tree
 from ..analysis import counting, floors
 from ..environments.host import AbstractHostEnvironment
 from ..environments.sequence_classification import SequenceClassification
 from ..rollout import evaluate
+from ..types import Evaluation
 from .loop import Run
 
 EPISODES, HOST_EPISODES = 1000, 20  # a task outside JAX is slower by orders of magnitude
 STREAMED = 1000  # deeper sequences are streamed: memory does not grow with their length
+
+
+def in_turn(task: Any, policies: Any, episodes: int, *, key: PRNGKeyArray) -> Evaluation:
+    """`evaluate`, outside JAX `HOST_EPISODES` at a time: each takes a simulator of its own."""
+    if not issubclass(type(task), AbstractHostEnvironment) or episodes <= HOST_EPISODES:
+        return evaluate(task, policies, episodes, key=key)
+    turns = [
+        evaluate(task, policies, HOST_EPISODES, key=jax.random.fold_in(key, i))
+        for i in range(-(-episodes // HOST_EPISODES))
+    ]
+    return jax.tree.map(lambda *xs: jnp.concatenate(xs, axis=1)[:, :episodes], *turns)
 
 
 def describe(run: Run, task: Any, episodes: int | None, seed: int) -> Iterator[str]:
@@ -41,7 +55,7 @@ def describe(run: Run, task: Any, episodes: int | None, seed: int) -> Iterator[s
         yield f"  success          {np.mean(np.asarray(lengths) >= task.depth):.3f}"
         yield f"  signals right    median {int(np.median(lengths)):,}, worst {int(lengths.min()):,}"
         return
-    evaluation = evaluate(task, policies, episodes, key=key)
+    evaluation = in_turn(task, policies, episodes, key=key)
     yield f"{run.path}: {episodes} fresh episodes"
     for name in task.signals:
         values = np.asarray(evaluation.returns[name][0], np.float64)
