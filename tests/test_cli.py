@@ -410,6 +410,23 @@ def own_tasks(tmp_path, monkeypatch):
     sys.modules.pop("tasks_of_mine", None)
 
 
+def test_a_package_that_registers_its_tasks_is_imported(credo, tmp_path, monkeypatch):
+    """Gymnasium has no plug-ins: `package:Name-v0`, as in `gymnasium.make`."""
+    text = """
+        import gymnasium
+        from gymnasium.envs.classic_control import PendulumEnv
+
+        gymnasium.register("Swing/Mine-v3", lambda: PendulumEnv(), max_episode_steps=7)
+    """
+    (tmp_path / "registers_tasks.py").write_text(textwrap.dedent(text))
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = credo("check", "registers_tasks:Swing/Mine-v3")
+    assert (code, out) == (0, "registers_tasks:Swing/Mine-v3: 0 problems found\n")
+    code, _, err = credo("check", "registers_nothing:Mine-v3")
+    assert code == 2
+    assert "cannot import 'registers_nothing'" in err
+
+
 def test_check_finds_nothing_wrong_with_a_good_task(credo, own_tasks):
     assert credo("check", f"{own_tasks}:Good") == (0, f"{own_tasks}:Good: 0 problems found\n", "")
 

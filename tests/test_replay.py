@@ -1,5 +1,6 @@
 """Replay: a ring of rows that belong together."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -152,6 +153,13 @@ def test_too_little_memory_is_told_with_both_numbers(monkeypatch):
         Replay.empty(ROW, CAPACITY + 1)
     with pytest.raises(ValueError, match="capacity is 0"):
         Replay.empty(ROW, 0)
+
+
+def test_shapes_alone_need_no_memory(monkeypatch):
+    """A policy can be read where its run's buffer would not fit."""
+    monkeypatch.setattr(replay, "_memory", lambda: 1.0)
+    shapes = eqx.filter_eval_shape(lambda: Replay.empty(ROW, 1000))
+    assert shapes.data.obs.shape[0] == 1000
 
 
 def test_this_machine_says_its_memory():

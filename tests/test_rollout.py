@@ -404,6 +404,35 @@ def test_a_member_that_acts_nan_has_a_nan_return_and_spoils_nobody_else(env):
         assert np.isfinite(kept).all()  # learners would never recover
 
 
+class Broken(Walk):
+    """A walk whose world says NaN beyond 0.5, in `what`."""
+
+    what: str = eqx.field(static=True, default="obs")
+
+    def step(self, state, action, *, key):
+        state, step = super().step(state, action, key=key)
+        nan = jnp.where(step.obs[0] > 0.5, jnp.nan, 0.0)
+        if self.what == "obs":
+            return state, eqx.tree_at(lambda s: s.obs, step, step.obs + nan)
+        rewards = {name: reward + nan for name, reward in step.rewards.items()}
+        return state, eqx.tree_at(lambda s: s.rewards, step, rewards)
+
+
+@pytest.mark.parametrize("what", ["obs", "rewards"])
+def test_a_jax_task_that_says_nan_spoils_no_buffer(what):
+    population = constants(0.9, -0.1)
+    played, experience = rollout.collect(Broken(what=what), population, 2, key=jax.random.key(0))
+    for returns in played.returns.values():
+        assert np.isnan(returns).tolist() == [[True] * 2, [False] * 2]
+    valid = np.asarray(experience.valid)
+    assert 0 < valid.sum() < int(played.steps.sum())
+    for leaf in jax.tree.leaves(experience.transitions):
+        assert np.isfinite(np.asarray(leaf)[valid]).all()
+    returns = rollout.evaluate(Broken(what=what), population, 2, key=jax.random.key(0)).returns
+    for name in returns:
+        np.testing.assert_array_equal(returns[name], played.returns[name])
+
+
 def test_seeds_of_a_host_task_follow_the_key():
     env = HostWalk(spread=0.5)
     twins = constants(0.1, 0.1)

@@ -473,7 +473,13 @@ def _task(name: str) -> Any:
         return _own_task(name)
     import gymnasium
 
-    if name not in gymnasium.registry:
+    module, _, registered = name.rpartition(":")
+    if module:  # package:Name-v0, registered when it is imported
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            fail(f"cannot import {module!r} of {name!r}: {error}")
+    if registered not in gymnasium.registry:
         fail(
             f"no task {name!r}; one of your own is written package.module:Class",
             name,

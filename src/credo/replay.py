@@ -9,6 +9,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
@@ -34,14 +35,16 @@ class Replay(eqx.Module):
         """
         require.at_least("capacity", capacity, 1)
         needed, free = capacity * row_bytes(row), _memory()
-        if needed > free:
+        written = jnp.zeros((), jnp.int32)
+        # Shapes alone take no memory: who asks for them only wants to read a policy, say.
+        if needed > free and not isinstance(written, jax.core.Tracer):
             raise ValueError(
                 f"a replay buffer of {capacity:,} transitions needs {needed / 1e9:.1f} GB and this "
                 f"machine has {free / 1e9:.1f} GB: give a smaller capacity, at most "
                 f"{int(free // row_bytes(row)):,}"
             )
         zeros = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), row)
-        return cls(zeros, jnp.int32(0))
+        return cls(zeros, written)
 
     @property
     def capacity(self) -> int:
@@ -80,16 +83,11 @@ def extend(replay: Replay, rows: Transition, valid: Array | None = None) -> Repl
     if valid is not None:
         return _extend((rows, valid), replay)
     n = rows.terminated.shape[0]
-    for start in range(0, n, BLOCK):
-        end = min(start + BLOCK, n)
-        pad = BLOCK - (end - start)
-        block = jax.tree.map(
-            lambda x, start=start, end=end, pad=pad: np.pad(
-                x[start:end], [(0, pad)] + [(0, 0)] * (x.ndim - 1)
-            ),
-            rows,
-        )
-        replay = _extend((block, np.arange(BLOCK) < end - start), replay)
+    blocks = range(0, n, BLOCK)
+    padded = jax.tree.map(lambda x: np.resize(x, (len(blocks) * BLOCK, *x.shape[1:])), rows)
+    for start in blocks:
+        block = jax.tree.map(lambda x, start=start: x[start : start + BLOCK], padded)
+        replay = _extend((block, np.arange(start, start + BLOCK) < n), replay)
     return replay
 
 

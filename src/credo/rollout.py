@@ -40,7 +40,7 @@ def evaluate(
     and not luck; otherwise each member draws its own.
     """
     if isinstance(env, AbstractHostEnvironment):
-        return collect(env, population, episodes, common=common, key=key)[0]
+        return _play_on_host(env, population, episodes, episodes, common, False, key=key)[0]
     if isinstance(env, AbstractSequenceTask) and getattr(population, "features_first", False):
         return _answer(env, population, episodes, common, key=key)
     return _play(env, population, episodes, jnp.int32(episodes), common, False, key=key)[0]
@@ -63,7 +63,7 @@ def collect(
     """
     wanted = episodes if wanted is None else wanted
     if isinstance(env, AbstractHostEnvironment):
-        return _collect_on_host(env, population, episodes, wanted, common, key)
+        return _play_on_host(env, population, episodes, wanted, common, True, key=key)
     return _play(env, population, episodes, jnp.int32(wanted), common, True, key=key)
 
 
@@ -131,7 +131,8 @@ def _play(
     states, first = _each(lambda key: env.reset(key=key))(reset_keys)
     carries = _start(population, jax.random.split(policy_key, lanes))
     active = jnp.broadcast_to(jnp.arange(episodes) < wanted, lanes)
-    lost = jnp.zeros_like(active)  # who said NaN goes on with 0, and has a return of NaN
+    # Whose policy or world said NaN goes on, has a return of NaN, and is not remembered.
+    lost = jnp.zeros_like(active)
     totals = (jax.tree.map(jnp.zeros_like, first.rewards), jnp.zeros(lanes, jnp.int32), lost)
     rows = None
     if record:
@@ -146,30 +147,35 @@ def _play(
     def advance(loop):
         t, states, obs, carries, active, (returns, steps, lost), rows = loop
         actions, carries = _act(population, obs, carries)
-        nan = ~jnp.isfinite(actions)
-        lost = lost | (active & jnp.any(nan.reshape(*lanes, -1), axis=2))
-        actions = jnp.where(nan, 0.0, actions)
+        sound = _sound(actions)
+        actions = jnp.where(jnp.isfinite(actions), actions, 0.0)
         keys = _each(lambda key: jax.random.fold_in(key, t))(step_keys)
         bounded = jnp.clip(actions, -1.0, 1.0)
         states, step = _each(lambda s, a, key: env.step(s, a, key=key))(states, bounded, keys)
+        for x in jax.tree.leaves((step.obs, step.rewards)):
+            sound = sound & _sound(x)
+        lost = lost | (active & ~sound)
         returns = jax.tree.map(
             lambda sum_, x: sum_ + jnp.where(_over(active, x), x, 0.0), returns, step.rewards
         )
         steps = steps + active.astype(jnp.int32)
         if record:
             ends = (step.terminated, step.truncated)
-            row = (Transition(obs, actions, step.rewards, step.obs, *ends), active)
+            row = (Transition(obs, actions, step.rewards, step.obs, *ends), active & ~lost)
             rows = jax.tree.map(lambda xs, x: xs.at[t].set(x), rows, row)
         active = active & ~(step.terminated | step.truncated)
         return t + 1, states, step.obs, carries, active, (returns, steps, lost), rows
 
     *_, (returns, steps, lost), rows = jax.lax.while_loop(ongoing, advance, start)
     returns = jax.tree.map(lambda x: jnp.where(_over(lost, x), jnp.nan, x), returns)
-    if record:
-        # Episode by episode, as they would be met one after the other.
-        flat = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2).reshape(-1, *x.shape[3:]), rows)
-        return Evaluation(returns, steps), Experience(*flat)
-    return Evaluation(returns, steps), None
+    # Episode by episode, as they would be met one after the other.
+    flat = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2).reshape(-1, *x.shape[3:]), rows)
+    return Evaluation(returns, steps), Experience(*flat) if record else None
+
+
+def _sound(x: Array) -> Bool[Array, "pop episodes"]:
+    """In which lanes there are numbers alone."""
+    return jnp.all(jnp.isfinite(x).reshape(*x.shape[:2], -1), axis=2)
 
 
 def _over(lanes: Bool[Array, "pop episodes"], x: Array) -> Bool[Array, "..."]:
@@ -177,14 +183,16 @@ def _over(lanes: Bool[Array, "pop episodes"], x: Array) -> Bool[Array, "..."]:
     return lanes.reshape(lanes.shape + (1,) * (x.ndim - lanes.ndim))
 
 
-def _collect_on_host(
+def _play_on_host(
     env: AbstractHostEnvironment,
     population: PyTree,
     episodes: int,
     wanted: Int[Array, ""] | int,
     common: bool,
+    record: bool,
+    *,
     key: PRNGKeyArray,
-) -> tuple[Evaluation, Experience]:
+) -> tuple[Evaluation, Any]:
     """The same with copies outside JAX: actions go there and time steps come back, once per step
     for all lanes together."""
     pop = tree.size(population)
@@ -195,33 +203,41 @@ def _collect_on_host(
     copies = env.copies(pop * episodes)
     active = np.tile(np.arange(episodes) < int(wanted), pop)
     lost = np.zeros_like(active)  # as in `_play`
+    totals = {name: np.zeros(active.shape) for name in env.signals}
+    steps, rows, valid = np.zeros(active.shape, np.int32), [], []
     obs = copies.reset(np.asarray(seeds).reshape(-1), active)
-    rows, played = [], []
     for _ in range(env.max_steps):
         action, carry = act(arrays, obs, carry)
         action = np.asarray(action)
         nan = ~np.isfinite(action)
         lost, action = lost | (active & nan.any(axis=1)), np.where(nan, np.float32(0.0), action)
         step = copies.step(action, active)
-        rows.append((obs, action, step.rewards, step.obs, step.terminated, step.truncated))
-        played.append(active)
+        for name, reward in step.rewards.items():
+            totals[name] += np.where(active, reward, 0.0)
+        steps += active
+        if record:
+            rows.append((obs, action, step.rewards, step.obs, step.terminated, step.truncated))
+            valid.append(active & ~lost)
         active = active & ~(step.terminated | step.truncated)
         obs = step.obs
         if not active.any():
             break
-    valid = np.stack(played)
-    lanes = Transition(*jax.tree.map(lambda *xs: np.stack(xs), *rows))
-    returns = {}
-    for name, reward in lanes.rewards.items():
-        total = np.where(valid, reward, 0.0).sum(axis=0, dtype=np.float64)
-        total = np.where(lost, np.nan, total).astype(np.float32)
-        returns[name] = jnp.asarray(total.reshape(pop, episodes))
-    steps = jnp.asarray(valid.sum(axis=0, dtype=np.int32).reshape(pop, episodes))
 
-    def kept(x):
-        return x.swapaxes(0, 1)[valid.T].astype(np.float32 if x.dtype == np.float64 else x.dtype)
+    def shaped(x):
+        return jnp.asarray(x.reshape(pop, episodes))
 
-    return Evaluation(returns, steps), Experience(jax.tree.map(kept, lanes), None)
+    def kept(*xs):
+        x = np.stack(xs, axis=1)[np.stack(valid, axis=1)]
+        return x.astype(np.float32) if x.dtype == np.float64 else x
+
+    returns = {
+        name: shaped(np.where(lost, np.nan, total).astype(np.float32))
+        for name, total in totals.items()
+    }
+    played = Evaluation(returns, shaped(steps))
+    if not record:
+        return played, None
+    return played, Experience(Transition(*jax.tree.map(kept, *rows)), None)
 
 
 @functools.lru_cache(maxsize=64)

@@ -105,6 +105,9 @@ def test_impossible_settings_are_refused():
         UCB(exploration=-1.0)
     with pytest.raises(ValueError, match="memory is 2"):
         UCB(memory=2.0)
+    for manager in (UCB, Uniform, Thompson):
+        with pytest.raises(ValueError, match=r"memory is 0.0: it must lie in \(0, 1\]"):
+            manager(memory=0.0)
 
 
 @pytest.mark.parametrize("manager", [UCB(), Thompson()])

@@ -27,8 +27,8 @@ from ..types import Metrics
 class OffPolicyState(eqx.Module):
     learner: PyTree
     replay: Replay
-    champion: AbstractPolicy  # the actor as it was last tested
-    score: Float[Array, ""]  # of that test
+    champion: AbstractPolicy  # the actor
+    score: Float[Array, ""]  # of its last test
     frames: Int[Array, ""]
 
 
@@ -78,6 +78,7 @@ class OffPolicy(eqx.Module):
 
     def init(self, *, key: PRNGKeyArray) -> OffPolicyState:
         env = self.env
+        require.trainable(env)
         learner = self.learner.init(self.network, env.obs_size, env.action_size, key=key)
         replay = Replay.empty(blank(env), self.replay_capacity)
         actor = self.learner.actor(learner)
@@ -115,7 +116,7 @@ class OffPolicy(eqx.Module):
 
         # Test the actor without noise, now and then.
         actor = self.learner.actor(learner)
-        due = (frames // self.test_every > state.frames // self.test_every) | (state.frames == 0)
+        due = (frames // self.test_every > state.frames // self.test_every) | jnp.isnan(state.score)
         score = when(
             due,
             lambda: rollout.score(self.env, actor, self.test_episodes, key=test_key),
@@ -129,5 +130,4 @@ class OffPolicy(eqx.Module):
             "frames": new,
             "updates": updates,
         }
-        champion = tree.where(due, actor, state.champion)
-        return OffPolicyState(learner, replay, champion, score, frames), metrics
+        return OffPolicyState(learner, replay, actor, score, frames), metrics

@@ -108,6 +108,7 @@ class PPO(eqx.Module):
 
     def init(self, *, key: PRNGKeyArray) -> PPOState:
         env = self.env
+        require.trainable(env)
         actor_key, critic_key = jax.random.split(key)
         mean = self.network.init(env.obs_size, env.action_size, key=actor_key)
         require_memoryless(self.network, mean)
@@ -149,7 +150,7 @@ class PPO(eqx.Module):
             self, networks, state.optimizer, replay, key=learn_key
         )
 
-        due = (frames // self.test_every > state.frames // self.test_every) | (state.frames == 0)
+        due = (frames // self.test_every > state.frames // self.test_every) | jnp.isnan(state.score)
         score = when(
             due,
             lambda: rollout.score(self.env, actor.mean, self.test_episodes, key=test_key),
@@ -163,9 +164,8 @@ class PPO(eqx.Module):
             "champion_score": score,
             "frames": new,
         }
-        champion = tree.where(due, actor.mean, state.champion)
         length = new.astype(jnp.float32) / wanted.astype(jnp.float32)
-        return PPOState(actor, critic, opt, replay, champion, score, length, frames), metrics
+        return PPOState(actor, critic, opt, replay, actor.mean, score, length, frames), metrics
 
     def warm(self, state: PPOState, policy: AbstractPolicy) -> PPOState:
         """`state` that goes on from a saved policy of the same network."""

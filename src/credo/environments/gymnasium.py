@@ -114,7 +114,8 @@ class Gymnasium(AbstractHostEnvironment):
     goes wrong raises `EnvironmentFailure`, and the next `copies` start a new worker.
     """
 
-    id: str = eqx.field(static=True)  # "Hopper-v5", or "package.module:Class"
+    id: str = eqx.field(static=True)
+    """"Hopper-v5", "package.module:Class", or "package:Name-v0" of a package that registers it."""
     kwargs: tuple[tuple[str, Any], ...] = eqx.field(static=True, default=(), converter=_pairs)
     max_episode_steps: int | None = eqx.field(static=True, default=None)  # None: its own
     timeout: float = eqx.field(static=True, default=60.0)  # seconds that one call may take
@@ -147,6 +148,10 @@ class Gymnasium(AbstractHostEnvironment):
     @property
     def max_steps(self) -> int:
         return self._sizes()["max_steps"]
+
+    @property
+    def discrete(self) -> bool:
+        return bool(self._sizes()["discrete"])
 
     def copies(self, n: int) -> "GymnasiumCopies":
         if n < 1:

@@ -68,6 +68,7 @@ class AbstractHostEnvironment(eqx.Module):
         max_steps: eqx.AbstractVar[int]  # no episode is longer
         signals: eqx.AbstractVar[tuple[str, ...]]  # names of the rewards, as in a JAX task
     agents: ClassVar[int | None] = None
+    discrete: ClassVar[bool] = False  # the largest of an action's entries is taken
 
     @abc.abstractmethod
     def copies(self, n: int) -> AbstractCopies:

@@ -73,6 +73,7 @@ class Environments:
         self.max_steps = _time_limit(self._envs[0], spec["max_episode_steps"])
         self.obs_size, self._write = _observations(self._envs[0].observation_space)
         self.action_size, self._read = _actions(self._envs[0].action_space)
+        self.discrete = isinstance(self._envs[0].action_space, gymnasium.spaces.Discrete)
         self._steps = [-1] * n  # in this episode; -1: there is none
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> Frame:
@@ -140,7 +141,8 @@ class Environments:
         )
 
     def sizes(self) -> dict[str, int]:
-        return {name: getattr(self, name) for name in ("obs_size", "action_size", "max_steps")}
+        names = ("obs_size", "action_size", "max_steps", "discrete")
+        return {name: getattr(self, name) for name in names}
 
     usable = True
 
@@ -168,11 +170,14 @@ class _blaming:
 
 
 def _make(spec: dict[str, Any]) -> gymnasium.Env:
-    """One environment, by its Gymnasium id or as `package.module:Class`."""
+    """One environment, by its Gymnasium id, as `package.module:Class`, or by an id that a module
+    registers when it is imported: `package.module:Name-v0`."""
     module, _, name = spec["id"].partition(":")
     cls = getattr(importlib.import_module(module), name, None) if name.isidentifier() else None
     if cls is None:
-        return _registered(**spec)
+        if name:
+            importlib.import_module(module)
+        return _registered(**spec | {"id": name or module})
     _hear_mujoco()
     env = cls(**spec["kwargs"])
     if not isinstance(env, gymnasium.Env):

@@ -132,6 +132,10 @@ class DelayedHostReward(AbstractHostEnvironment):
     def agents(self) -> int | None:
         return self.env.agents
 
+    @property
+    def discrete(self) -> bool:
+        return self.env.discrete
+
     def copies(self, n: int) -> "DelayedCopies":
         inner = self.env.copies(n)
         if (self, n) not in _DELAYED or _DELAYED[self, n].inner is not inner:

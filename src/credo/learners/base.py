@@ -2,6 +2,7 @@
 share."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -51,23 +52,19 @@ class AbstractLearner(eqx.Module):
 
 
 def learn(
-    learner: AbstractLearner,
-    state: PyTree,
-    replay: Replay,
-    updates: Int[Array, ""],
-    *,
-    signal: str,
-    key: PRNGKeyArray,
+    learner: AbstractLearner, state: PyTree, replay: Replay, updates: Int[Array, ""], **rest: Any
 ) -> tuple[PyTree, Metrics]:
     """`updates` gradient steps, each on a minibatch of its own, in one program. Their number is
-    data. `signal`: what a learner optimises that names no reward itself.
+    data.
+
+    **Arguments:** `signal`: what a learner optimises that names no reward itself. `key`.
 
     **Returns:** the new state and the mean of each metric; NaN if there was no update.
     """
     if not isinstance(updates, jax.core.Tracer) and updates == 0:
         # Nothing need be compiled for it: the first fitness of a run comes sooner.
         return state, {name: jnp.float32(jnp.nan) for name in learner.metrics}
-    return _learn(learner, state, replay, updates, learner.signal or signal, key=key)
+    return _learn(learner, state, replay, updates, **rest)
 
 
 @jit
@@ -76,8 +73,8 @@ def _learn(
     state: PyTree,
     replay: Replay,
     updates: Int[Array, ""],
-    signal: str,
     *,
+    signal: str,
     key: PRNGKeyArray,
 ) -> tuple[PyTree, Metrics]:
     dynamic, static = eqx.partition(state, eqx.is_array)
@@ -86,7 +83,7 @@ def _learn(
         dynamic, total = loop
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
         rows = replay.sample(learner.batch_size, key=sample_key)
-        reward = rows.rewards[signal]
+        reward = rows.rewards[learner.signal or signal]
         ends = (rows.terminated, rows.truncated)
         batch = Batch(rows.obs, rows.action, reward, rows.next_obs, *ends)
         state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)

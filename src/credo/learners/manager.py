@@ -38,6 +38,10 @@ class AbstractManager(eqx.Module):
 
     memory: eqx.AbstractVar[float]  # α: weight of the newest return, in (0, 1]
 
+    def __check_init__(self):
+        if isinstance(self.memory, float) and not 0.0 < self.memory <= 1.0:
+            raise ValueError(f"memory is {self.memory}: it must lie in (0, 1]")
+
     @jit
     def observe(
         self, ledger: Ledger, i: int, returns: Float[Array, " n"], played: Bool[Array, " n"]
@@ -76,7 +80,6 @@ class UCB(AbstractManager):
 
     def __check_init__(self):
         require.at_least("exploration", self.exploration, 0)
-        require.within("memory", self.memory, 0, 1)
 
     def allocate(self, ledger, workers, *, key):
         bounds = self.bounds(ledger)
@@ -109,10 +112,6 @@ class Thompson(AbstractManager):
     distribution of its mean (Thompson 1933)."""
 
     memory: float = 0.2  # α
-
-    def __check_init__(self):
-        if isinstance(self.memory, float) and not 0.0 < self.memory <= 1.0:
-            raise ValueError(f"memory is {self.memory}: it must lie in (0, 1]")
 
     def allocate(self, ledger, workers, *, key):
         variance = jnp.maximum(ledger.square - ledger.value**2, 0.0)

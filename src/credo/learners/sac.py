@@ -98,7 +98,7 @@ class SAC(AbstractLearner):
     def __check_init__(self):
         require.within("gamma", self.gamma, 0, 1)
         require.within("tau", self.tau, 0, 1)
-        for name in ("actor_lr", "critic_lr", "alpha_lr"):
+        for name in ("actor_lr", "critic_lr", "alpha_lr", "reward_scale"):
             require.at_least(name, getattr(self, name), 0)
         for name in ("critics", "batch_size"):
             require.at_least(name, getattr(self, name), 1)

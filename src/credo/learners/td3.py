@@ -64,7 +64,9 @@ class TD3(AbstractLearner):
     def __check_init__(self):
         require.within("gamma", self.gamma, 0, 1)
         require.within("tau", self.tau, 0, 1)
-        for name in ("actor_lr", "critic_lr", "target_noise", "target_noise_clip"):
+        for name in ("actor_lr", "critic_lr", "target_noise", "target_noise_clip", "reward_scale"):
+            require.at_least(name, getattr(self, name), 0)
+        for name in ("actor_max_norm", "critic_max_norm"):
             require.at_least(name, getattr(self, name), 0)
         for name in ("critics", "policy_delay", "batch_size"):
             require.at_least(name, getattr(self, name), 1)
@@ -81,15 +83,8 @@ class TD3(AbstractLearner):
             self.critic.init(obs_size, action_size, key=key)
             for key in jax.random.split(critic_key, self.critics)
         )
-        return TD3State(
-            actor,
-            critics,
-            actor,
-            critics,
-            adam_state(actor),
-            adam_state(critics),
-            jnp.int32(0),
-        )
+        opts = (adam_state(actor), adam_state(critics))
+        return TD3State(actor, critics, actor, critics, *opts, jnp.int32(0))
 
     def update(
         self, state: TD3State, batch: Batch, *, key: PRNGKeyArray

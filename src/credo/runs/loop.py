@@ -82,7 +82,8 @@ class Run:
 
     @property
     def champion(self) -> PyTree:
-        """The policy with the highest fitness of the last generation."""
+        """The policy with the highest fitness of the last generation; of a learner alone, its
+        actor."""
         like = eqx.filter_eval_shape(self.algorithm.init, key=jax.random.key(0)).champion
         return checkpoint.import_policy(self.path / "champion.safetensors", like)
 
