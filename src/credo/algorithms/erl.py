@@ -127,8 +127,8 @@ class ERL(eqx.Module):
 
     @classmethod
     def ours(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """ERL for a reward that comes late, in thousands: a TD3 learner with a long horizon and small
-        rewards that learns much from few frames and joins the population every generation. Chosen
+        """ERL for a reward that comes late, in thousands: a TD3 learner with a long horizon and
+        small rewards that learns much from few frames and joins every generation. Chosen
         by looking at the hard double pendulum, seeds 100 to 102."""
         network = network or MLP(hidden=(64, 64), activation="relu", initializer="uniform")
         learner = TD3(
