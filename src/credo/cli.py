@@ -100,7 +100,7 @@ EXPERIMENTS = {
 PRESETS = {
     "as-written": "Algorithm 2 as printed (the default)",
     "as-coded": "the author's operators of 2017",
-    "ours": "the best settings found: start here for a task of your own",
+    "ours": "the best settings found: start here for a task of your own; of erl, for late rewards",
 }
 POPPED = ("--network", "--preset", "--delayed", "--from")  # flags that are no fields
 COMMANDS = {
@@ -243,6 +243,7 @@ tasks:      {", ".join(TASKS)}
             or package.module:Class
 networks:   {", ".join(NETWORKS)} (default: the algorithm's own)
 presets:    {", ".join(PRESETS)} (default: as-written), of neuroevolution
+            ours, of erl: for a reward that comes late
 
 credo train ALGORITHM TASK --help lists every flag with its unit and default."""
 

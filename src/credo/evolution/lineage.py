@@ -13,8 +13,8 @@ class Lineage(eqx.Module):
 
     maker: Int[Array, " pop"]  # index into `MAKERS`: the last that changed it
     share: Float[Array, "pop 1+q"]
-    """Expected share of its weights that go back to the first draw and to each learner's actor,
-    mutated since or not."""
+    """Share of its weights that go back to the first draw and to each learner's actor, mutated
+    since or not; after a crossover expected, as if the parents' shares lay everywhere alike."""
     guest: Int[Array, " pop"]  # learner whose actor was put here and not evaluated yet, else -1
 
     @classmethod

@@ -45,7 +45,7 @@ def sections(measured: dict[str, Any]) -> list[Any]:
             measured,
             "The last to change a champion is mutation nearly always, elites and fresh actors of "
             "the learner aside: most offspring are mutated. Shares of weights say more: a child "
-            "has them from its parent, a crossed one half from each of two, expected, and mutation "
-            "does not change whose line it is.",
+            "has them from its parent, a crossed one from each of two what it took of them, and "
+            "mutation does not change whose line it is.",
         ),
     ]

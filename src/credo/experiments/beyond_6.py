@@ -6,7 +6,6 @@ from ..algorithms.off_policy import OffPolicy
 from ..learners.manager import UCB, Thompson, Uniform
 from ..learners.sac import SAC
 from ..networks.mlp import ResidualCritic
-from ..runs.loop import Run
 from . import chapter5, chapter6
 from .base import Cell
 
@@ -36,15 +35,14 @@ def cells(budget: str) -> list[Cell]:
     ]
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return chapter6.measure(runs, budget)
+measure = chapter6.measure
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:
     with_manager = {name: cell for name, cell in measured.items() if "attribution" in cell}
     return [
         *chapter5.by_task(measured),
-        chapter5.scores(measured),
+        chapter5.scores(measured, interval=True),
         chapter6.allocation(with_manager, {}),
         *chapter6.attributions(measured),
         chapter5.about(

@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.stats
 
 from .. import tree
 from ..algorithms.erl import ERL
 from ..algorithms.off_policy import OffPolicy
 from ..algorithms.ppo import PPO
 from ..analysis import attribution, statistics
-from ..environments.gymnasium import Gymnasium
+from ..environments.gymnasium import Gymnasium, close_all
 from ..environments.wrappers import DelayedHostReward
 from ..environments.wrappers import delayed as with_delay
 from ..networks.exploration import Explorer, GaussianNoise
@@ -26,6 +27,7 @@ from .base import Cell
 BUDGETS = ("smoke", "quick", "full", "million", "published")
 TASKS = ("HalfCheetah-v5", "Swimmer-v5", "Reacher-v5", "Ant-v5", "Hopper-v5", "Walker2d-v5")
 STAND_IN = "InvertedPendulum-v5"  # for every task at smoke, with tiny networks
+TINY = 5_000  # frames: a run that is shorter shows no result
 ALGORITHMS = {"erl": ERL.erl, "ea": ERL.ea, "ddpg": OffPolicy.ddpg, "ppo": PPO.ppo}
 EPISODES, RANDOM_EPISODES = 10, 100  # that measure a final champion, and a random policy
 SMOOTHED = 10  # generations; the author's undisclosed moving average
@@ -196,6 +198,11 @@ def _small(learner: Any) -> Any:
 # ---------------------------------------------------------------------------------------- scores
 
 
+def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
+    """Scores of every cell."""
+    return {name: outcome(name, cell) for name, cell in runs.items()}
+
+
 def outcome(name: str, runs: list[Run], axis: str = "frames") -> dict[str, Any]:
     """Scores of the runs of a cell: curves over `axis`, the last test, and the final champions on
     fresh episodes that they share."""
@@ -212,6 +219,8 @@ def outcome(name: str, runs: list[Run], axis: str = "frames") -> dict[str, Any]:
     grid = attribution.axis(xs, POINTS)
     smooth = [statistics.moving_average(score, SMOOTHED) for score in scores]
     updates = [m["updates"].sum() / m["frames"][-1] if "updates" in m else np.nan for m in metrics]
+    floor = random_returns(undelayed(env))
+    close_all()  # simulators of dozens of episodes
     return {
         "task": task_of(env),
         "label": label_of(name),
@@ -225,7 +234,7 @@ def outcome(name: str, runs: list[Run], axis: str = "frames") -> dict[str, Any]:
         "final": attribution.plain(played.returns[env.signals[-1]], 2),
         "played": [int(m["frames"][-1]) for m in metrics],
         "updates per frame": attribution.plain(updates, 3),
-        "floor": attribution.plain(random_returns(undelayed(env)), 2),
+        "floor": attribution.plain(floor, 2),
     }
 
 
@@ -310,11 +319,13 @@ def scores(
     published: dict[str, str] | None = None,
     reference: dict[str, dict[str, float]] | None = None,
     caption: str = "",
+    interval: bool = False,
 ) -> Table:
     """Scores of every cell, beside floor, published value and what others reached.
 
     **Arguments:** `published`: by the name of the cell. `reference`: columns, by their title; of
-    each the value by task. By default those of others at 1M frames.
+    each the value by task. By default those of others at 1M frames. `interval`: also the 95 %
+    confidence interval of the mean, which chapter 6 gives.
     """
     if reference is None:
         reference = {f"{who}, 1M frames": values for who, values in AT_1M.items()}
@@ -334,6 +345,7 @@ def scores(
                 (published or {}).get(name, "–"),
                 spread(final),
                 middle(final),
+                *([confidence(final)] if interval else []),
                 f"{spread(cell['last'])} / {number(np.mean(cell['last smoothed']))}",
                 f"{np.mean(cell['played']):,.0f}",
                 _mean(cell["updates per frame"]),
@@ -349,6 +361,7 @@ def scores(
             "published",
             "final champion",
             "median (range)",
+            *(["95 % interval of the mean"] if interval else []),
             "last test, raw / smoothed",
             "frames",
             "updates per frame",
@@ -369,7 +382,7 @@ def about(measured: dict[str, Any], *paragraphs: str) -> Text:
     stand_in = [
         f"{STAND_IN} with tiny networks stands in for the published tasks: this page shows that "
         "everything runs, and no result."
-    ] * (STAND_IN in of.values())
+    ] * (STAND_IN in of.values() and max(max(x["played"]) for x in measured.values()) < TINY)
     return Text(
         "How to read it",
         [
@@ -395,6 +408,16 @@ def middle(x: Any) -> str:
     """Median and range over runs."""
     x = np.array(x, np.float64)
     return f"{number(np.median(x))} ({number(x.min())}…{number(x.max())})"
+
+
+def confidence(x: Any) -> str:
+    """95 % confidence interval of the mean over runs, by Student's t."""
+    x = np.array(x, np.float64)
+    if len(x) < 2:
+        return "–"
+    mean, error = (float(y) for y in statistics.mean_and_standard_error(x))
+    half = float(scipy.stats.t.ppf(0.975, len(x) - 1)) * error
+    return f"{number(mean - half)} … {number(mean + half)}"
 
 
 def number(x: Any) -> str:

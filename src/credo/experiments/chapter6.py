@@ -81,6 +81,7 @@ def allocation(measured: dict[str, Any], given: dict[str, tuple[float, ...]]) ->
                 [
                     cell["task"] if i == 0 else "",
                     cell["label"] if i == 0 else "",
+                    f"{np.mean(cell['played']):,.0f}" if i == 0 else "",
                     learner,
                     f"{even:.0f}",
                     f"{100 * published[i]:.0f}" if published else "–",
@@ -90,7 +91,7 @@ def allocation(measured: dict[str, Any], given: dict[str, tuple[float, ...]]) ->
             )
     return Table(
         "Cumulative allocation, in percent of all rollout workers",
-        ["task", "algorithm", "learner", "even", "published", "measured", "each run"],
+        ["task", "algorithm", "frames", "learner", "even", "published", "measured", "each run"],
         rows,
         caption="Mean ± standard error over runs.",
     )

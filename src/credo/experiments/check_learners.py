@@ -9,7 +9,6 @@ from ..learners.sac import SAC
 from ..learners.td3 import TD3, TD3_NETWORK, ddpg
 from ..networks.exploration import GaussianNoise
 from ..networks.mlp import MLP, Critic
-from ..runs.loop import Run
 from ..runs.page import Reference
 from . import chapter5
 from .base import Cell
@@ -67,8 +66,7 @@ def cells(budget: str) -> list[Cell]:
     return found
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return {name: chapter5.outcome(name, cell) for name, cell in runs.items()}
+measure = chapter5.measure
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:

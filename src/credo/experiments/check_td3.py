@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from ..runs.loop import Run
 from ..runs.page import Reference
 from . import chapter5
 from .base import Cell
@@ -20,8 +19,7 @@ def cells(budget: str) -> list[Cell]:
     return [chapter5.td3(task, budget) for task in chapter5.tasks(budget, tuple(AUTHORS))]
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return {name: chapter5.outcome(name, cell) for name, cell in runs.items()}
+measure = chapter5.measure
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:

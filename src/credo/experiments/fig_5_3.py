@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from ..runs.loop import Run
 from . import chapter5
 from .base import Cell
 
@@ -30,8 +29,7 @@ def cells(budget: str) -> list[Cell]:
     return found
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return {name: chapter5.outcome(name, cell) for name, cell in runs.items()}
+measure = chapter5.measure
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:

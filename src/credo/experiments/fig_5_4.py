@@ -6,7 +6,6 @@ import numpy as np
 
 from ..algorithms.erl import ERL
 from ..evolution.selection import Uniform
-from ..runs.loop import Run
 from ..runs.page import Table
 from . import chapter5
 from .base import Cell
@@ -31,8 +30,7 @@ def cells(budget: str) -> list[Cell]:
     ]
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return {name: chapter5.outcome(name, cell) for name, cell in runs.items()}
+measure = chapter5.measure
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:

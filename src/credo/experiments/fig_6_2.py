@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from ..runs.loop import Run
 from ..runs.page import Reference
 from . import chapter5, chapter6
 from .base import Cell
@@ -25,8 +24,7 @@ def cells(budget: str) -> list[Cell]:
     ]
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return chapter6.measure(runs, budget)
+measure = chapter6.measure
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:
@@ -40,7 +38,7 @@ def sections(measured: dict[str, Any]) -> list[Any]:
     hopper = "Hopper-v5" in chapter5.tasks_in(measured)
     return [
         *chapter5.by_task(measured, *(levels if hopper else [])),
-        chapter5.scores(measured, given),
+        chapter5.scores(measured, given, interval=True),
         *chapter6.attributions(measured),
         chapter5.about(measured),
     ]

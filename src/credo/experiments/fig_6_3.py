@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from ..runs.loop import Run
 from ..runs.page import Reference
 from . import chapter5, chapter6
 from .base import Cell
@@ -31,8 +30,7 @@ def cells(budget: str) -> list[Cell]:
     ]
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return chapter6.measure(runs, budget)
+measure = chapter6.measure
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:

@@ -3,7 +3,6 @@
 from typing import Any
 
 from ..learners.manager import UCB
-from ..runs.loop import Run
 from . import chapter5, chapter6
 from .base import Cell
 
@@ -27,14 +26,13 @@ def cells(budget: str) -> list[Cell]:
     ]
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return chapter6.measure(runs, budget)
+measure = chapter6.measure
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:
     return [
         *chapter5.by_task(measured),
-        chapter5.scores(measured),
+        chapter5.scores(measured, interval=True),
         chapter6.allocation(measured, {}),
         *chapter6.attributions(measured),
         chapter5.about(measured, f"The cell without a number has c = {PUBLISHED_C}."),

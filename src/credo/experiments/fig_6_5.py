@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from ..runs.loop import Run
 from . import chapter5, chapter6, fig_5_3
 from .base import Cell
 
@@ -27,15 +26,14 @@ def cells(budget: str) -> list[Cell]:
     return found
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return chapter6.measure(runs, budget)
+measure = chapter6.measure
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:
     swimmer = [fig_5_3.SWIMMER] if "Swimmer-v5" in chapter5.tasks_in(measured) else []
     return [
         *chapter5.by_task(measured),
-        chapter5.scores(measured),
+        chapter5.scores(measured, interval=True),
         *chapter6.attributions(measured),
         chapter5.about(measured, *swimmer),
     ]

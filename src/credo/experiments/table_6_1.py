@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from ..runs.loop import Run
 from . import chapter5, chapter6
 from .base import Cell
 
@@ -27,8 +26,7 @@ def cells(budget: str) -> list[Cell]:
     return [chapter6.cerl("cerl", task, budget) for task in chosen]
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return chapter6.measure(runs, budget)
+measure = chapter6.measure
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:
@@ -36,6 +34,6 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         chapter6.allocation(measured, GIVEN),
         *chapter6.attributions(measured),
         *chapter5.by_task(measured),
-        chapter5.scores(measured),
+        chapter5.scores(measured, interval=True),
         chapter5.about(measured),
     ]
