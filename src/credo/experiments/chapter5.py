@@ -382,7 +382,9 @@ def about(measured: dict[str, Any], *paragraphs: str) -> Text:
     stand_in = [
         f"{STAND_IN} with tiny networks stands in for the published tasks: this page shows that "
         "everything runs, and no result."
-    ] * (STAND_IN in of.values() and max(max(x["played"]) for x in measured.values()) < TINY)
+    ] * (
+        STAND_IN in of.values() and max(max(x.get("played", [0])) for x in measured.values()) < TINY
+    )
     return Text(
         "How to read it",
         [
