@@ -254,6 +254,21 @@ def test_allocation_stands_beside_the_published_one(runs_of):
     cell = chapter6.cerl("cerl", chapter5.STAND_IN, "smoke")
     measured = chapter6.measure({cell.name: runs_of(cell)}, "smoke")
     table = chapter6.allocation(measured, {"InvertedPendulum": (0.24, 0.35, 0.2, 0.2)})
-    assert [row[2] for row in table.rows] == [f"TD3 γ {g:g}" for g in chapter6.PORTFOLIO]
-    assert [row[4] for row in table.rows] == ["24", "35", "20", "20"]
-    assert [row[5] for row in table.rows] == [f"{10 * i:.1f} ± 0.0" for i in (1, 2, 3, 4)]
+    assert [row[2] for row in table.rows] == ["2,000", "", "", ""]
+    assert [row[3] for row in table.rows] == [f"TD3 γ {g:g}" for g in chapter6.PORTFOLIO]
+    assert [row[5] for row in table.rows] == ["24", "35", "20", "20"]
+    assert [row[6] for row in table.rows] == [f"{10 * i:.1f} ± 0.0" for i in (1, 2, 3, 4)]
+
+
+def test_intervals_are_those_of_student():
+    assert chapter5.confidence([1.0]) == "–"
+    low, high = map(float, chapter5.confidence([100.0, 200.0, 300.0]).split(" … "))
+    assert (low, high) == pytest.approx((200 - 248.4, 200 + 248.4), abs=0.1)  # 4.303 · 100 / √3
+
+
+def test_a_stand_in_is_told_from_the_task_itself(runs_of):
+    cell = check_td3.cells("smoke")[0]
+    found = {cell.name: chapter5.outcome(cell.name, runs_of(cell))}
+    assert "stands in for" in " ".join(chapter5.about(found).paragraphs)
+    found[cell.name]["played"] = [30_000, 30_000]
+    assert "stands in for" not in " ".join(chapter5.about(found).paragraphs)
