@@ -2,8 +2,9 @@
 generalized advantages (equation 11): the on-policy baseline of Chapter 5.
 
 Departures: a generation plays whole episodes, as many as last time's length says `horizon` frames
-need, so that its end is a state to resume from. Observations and rewards are not normalised, which
-most implementations do in silence: the policy acts on what the task says.
+need (at most `copies`), so that its end is a state to resume from. Observations and rewards are not
+normalised, which most implementations do in silence: the policy acts on what the task says. The
+clipped gradient, the first deviation and the tanh around the mean are not the paper's.
 """
 
 from collections.abc import Callable
@@ -97,7 +98,7 @@ class PPO(eqx.Module):
 
     @classmethod
     def ppo(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """The constants of its authors for MuJoCo."""
+        """The constants of its authors for MuJoCo, and what the paper leaves open."""
         given: dict[str, Any] = {} if network is None else {"network": network}
         return cls(env, **given | overrides)
 
