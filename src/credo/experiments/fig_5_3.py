@@ -44,8 +44,8 @@ def sections(measured: dict[str, Any]) -> list[Any]:
             "DDPG has the learner of ERL, alone, with the same networks, batch and updates per "
             "frame, after 1,000 frames of random actions; EA is the "
             "evolution of ERL, alone. The dissertation's DDPG and PPO were those "
-            "of OpenAI Baselines. PPO here does not normalise observations and rewards, which theirs "
-            "does: it is a lower line.",
+            "of OpenAI Baselines. PPO here does not normalise observations and rewards, which "
+            "theirs does: it is a lower line.",
             *missing,
             *swimmer,
         ),
