@@ -18,7 +18,7 @@ import time
 
 SMALL = (
     "--network.hidden 8 --warmup-frames 200 --replay-capacity 5000 --test-every 3 "
-    "--updates-per-frame 0.02"
+    "--updates-per-frame 0.02 --max-episode-steps 40"
 )
 TRAIN = {
     "neuroevolution": "neuroevolution sequence-classification --depth 3 --min-gap 1 --max-gap 3 "
@@ -26,7 +26,7 @@ TRAIN = {
     "erl": f"erl InvertedPendulum-v5 {SMALL} --sync-period 2",
     "cerl": f"cerl InvertedPendulum-v5 {SMALL}",
 }
-GENERATIONS = {"neuroevolution": 100_000, "erl": 400, "cerl": 100}  # enough for 20 kills
+GENERATIONS = {"neuroevolution": 100_000, "erl": 300, "cerl": 150}  # enough for 20 kills
 
 
 def start(run: pathlib.Path, what: str, generations: int) -> subprocess.Popen:

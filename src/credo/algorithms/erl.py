@@ -81,6 +81,8 @@ class ERL(eqx.Module):
     population_size: int = eqx.field(static=True, default=10)  # k
     elite_fraction: float = eqx.field(static=True, default=0.1)  # ψ
     episodes: int = eqx.field(static=True, default=1)  # ξ: per fitness
+    remember: bool = eqx.field(static=True, default=False)
+    """Judge an elite by all the episodes it ever played, not by the last ξ alone."""
     selection: AbstractSelection = Tournament()
     crossover: AbstractCrossover = MaskedCrossover()
     crossover_probability: float = 0.0  # chance to cross an offspring drawn once
@@ -220,8 +222,11 @@ class ERL(eqx.Module):
         replay: Any = extend(state.replay, rows, valid) if self.learners else None
 
         # 8-15: rank, keep the elites, select, cross and mutate.
+        lineage, standing = state.lineage, fitness
+        if self.remember:
+            lineage, standing = lineage.judged(fitness)
         population, lineage, fittest, bred = breed(
-            self, state.population, state.lineage, fitness, key=breed_key
+            self, state.population, lineage, standing, key=breed_key
         )
         # 16-20: learners play too, with noise; what they earn is their value.
         replay, ledger, counts, explored = self.explore(state, replay, key=explore_key)

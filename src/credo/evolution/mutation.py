@@ -62,10 +62,18 @@ class MatrixMutation(AbstractMutation):
 
     def hits(self, layout: tree.Layout, *, key: PRNGKeyArray) -> Bool[Array, " entries"]:
         """Which entries a mutation hits in the matrices whose gate is open."""
-        entry_key, count_key, sure_key = jax.random.split(key, 3)
+        entry_key, *share_keys = jax.random.split(key, 3)
         u = jax.random.uniform(entry_key, layout.leaf.shape)
-        if not self.up_to_fraction:
-            return u < self.fraction
+        return self.up_to(u, layout, *share_keys) if self.up_to_fraction else u < self.fraction
+
+    def up_to(
+        self,
+        u: Float[Array, " entries"],
+        layout: tree.Layout,
+        count_key: PRNGKeyArray,
+        sure_key: PRNGKeyArray,
+    ) -> Bool[Array, " entries"]:
+        """Of each matrix a share drawn anew, at least one entry."""
         sizes = jnp.asarray(layout.sizes, jnp.float32)
         most = jnp.ceil(self.fraction * sizes)
         count = jnp.minimum(

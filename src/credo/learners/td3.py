@@ -135,8 +135,7 @@ class TD3(AbstractLearner):
         return state.actor
 
     def explorer(self, state: TD3State, random: Bool[Array, ""]) -> AbstractPolicy:
-        action_size = state.critics[0].action_size
-        return Explorer(state.actor, self.noise, random, action_size)
+        return Explorer(state.actor, self.noise, random, state.critics[0].action_size)
 
     def warm(self, state: TD3State, actor: AbstractPolicy) -> TD3State:
         return eqx.tree_at(lambda s: (s.actor, s.target_actor), state, (actor, actor))
