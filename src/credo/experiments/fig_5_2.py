@@ -53,7 +53,7 @@ def cells(budget: str) -> list[Cell]:
             TASK,
             budget,
             delayed=delayed,
-            planned=Plan(limits[kind][0], RUNS[budget], 8.0 if label == "erl ours" else 1.0),
+            planned=Plan(limits[kind][0], RUNS[budget], 2.0 if label == "erl ours" else 1.0),
             generations=limits[kind][1],
             stop_at=SOLVED,
             test_episodes=10,
