@@ -469,3 +469,32 @@ def test_a_task_of_ones_own_is_trained_and_resumed(credo, own_tasks, tmp_path):
     code, out, _ = credo(f"resume {path} --generations 2")
     assert code == 0
     assert "generation 2," in out
+
+
+def test_a_run_that_ends_before_it_learns_is_mentioned(credo, tmp_path):
+    words = "train td3 Pendulum-v1 --frames 250 --test-episodes 1 --network.hidden 4 --path"
+    code, _, err = credo(*words.split(), str(tmp_path / "a"))
+    assert code == 0
+    assert "nothing is learned by gradient in the first 25,000 frames" in err
+    assert "fewer --start-frames" in err
+    _, _, err = credo(*words.split(), str(tmp_path / "b"), "--start-frames", "200")
+    assert "nothing is learned" not in err
+
+
+def test_a_task_is_checked_with_the_flags_it_is_given(credo, own_tasks):
+    task = f"{own_tasks}:Crumbling"
+    assert "line --max-episode-steps 1000" in credo("check", task)[1]
+    _, out, _ = credo("check", task, "--max-episode-steps", "2")
+    assert "no time limit" not in out
+
+
+def test_a_champion_of_another_network_is_refused_with_both(credo, tmp_path):
+    words = "train ea Pendulum-v1 --generations 1 --population-size 3 --elite-fraction 0.4"
+    assert credo(*words.split(), "--network.hidden", "4", "--path", str(tmp_path / "a"))[0] == 0
+    code, _, err = credo(
+        *words.split(), "--from", str(tmp_path / "a"), "--path", str(tmp_path / "b")
+    )
+    assert code == 1
+    assert "give the same --preset or --network" in err
+    assert "hidden=(4,)" in err
+    assert "hidden=(128, 128)" in err

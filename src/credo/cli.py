@@ -230,6 +230,7 @@ def _train(argv: list[str]) -> None:
     fields = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     fields |= {"wall_clock": seconds(options.wall_clock), "warm_start": warm_start or None}
     label = _label(names[0], names[1]) + "-delayed" * delayed
+    _note_start(algorithm, options.frames)
     _guarded(lambda: _start(algorithm, label, **fields))
 
 
@@ -447,9 +448,14 @@ def _report(argv: list[str]) -> None:
     _guarded(go)
 
 
+@dataclasses.dataclass
+class CheckOptions:
+    """Look for mistakes in a task. Flags of the task, such as --max-episode-steps, change it."""
+
+
 def _check(argv: list[str]) -> None:
     name, argv = _positional(argv, "check TASK", "a task's name or package.module:Class")
-    env = _task(name)
+    env, _ = parse("credo check TASK", _task(name), CheckOptions, argv, flat=True)
     problems = _problems(env)
     for problem in problems:
         print(f"- {problem}")
@@ -559,12 +565,29 @@ def _positional(argv: list[str], usage: str, what: str) -> tuple[str, list[str]]
 
 def _summary(run: Any) -> str:
     metrics = run.metrics
-    episodes = run.config["algorithm"].get("test_episodes")
+    settings = run.config["algorithm"]
+    score, episodes = f"{metrics['champion_score'][-1]:.4g}", settings.get("test_episodes")
+    if settings.get("test_every", 1) > 1:  # the champion of today need not be the one tested
+        score += " at the last test"
     return (
         f"{run.path}: generation {int(metrics['generation'][-1])}, best fitness "
-        f"{metrics['fitness_max'][-1]:.4g}, champion score {metrics['champion_score'][-1]:.4g}"
+        f"{metrics['fitness_max'][-1]:.4g}, champion score {score}"
         + (f" on {episodes} fresh episodes" if episodes is not None else "")
     )
+
+
+def _note_start(algorithm: Any, frames: int | None) -> None:
+    """Say so if a run will end before anybody learns."""
+    flag = next((x for x in ("start_frames", "warmup_frames") if hasattr(algorithm, x)), None)
+    if flag is None or frames is None or not getattr(algorithm, "learners", True):
+        return
+    start = getattr(algorithm, flag)
+    if frames <= start:
+        print(
+            f"credo: note: nothing is learned by gradient in the first {start:,} frames, and this "
+            f"run ends after {frames:,}: give more --frames, or fewer --{flag.replace('_', '-')}",
+            file=sys.stderr,
+        )
 
 
 def _guarded(go: Any) -> None:

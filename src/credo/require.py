@@ -32,7 +32,7 @@ def trainable(env: Any) -> None:
     """A task that gradient learners can be trained on: one agent, Box actions."""
     if env.agents is not None or getattr(env, "discrete", False):
         has = "Discrete actions" if env.agents is None else f"{env.agents} agents"
-        raise TypeError(
+        raise ValueError(
             f"{getattr(env, 'id', type(env).__name__)} has {has}: learners follow the gradient of "
             "one agent's continuous actions. Evolve without a learner (credo train ea), or give a "
             "task of one agent with Box actions"

@@ -229,6 +229,25 @@ def test_it_goes_on_from_a_given_policy(erl):
     assert same(LEARNER.actor(warm.learners[0]), given)
 
 
+def test_elites_may_be_judged_by_all_their_episodes():
+    algorithm = dataclasses.replace(ALGORITHM, remember=True)
+    rows, states = run(algorithm, 4)
+    assert states[0].lineage.times.tolist() == [0.0] * K
+    assert states[1].lineage.times.tolist() == [1.0] * E + [0.0] * (K - E)
+    keys = [jax.random.split(key_of(g), 6)[0] for g in (1, 2)]
+    pairs = zip(states, keys, strict=False)
+    played = [rollout.evaluate(ALGORITHM.env, s.population, 1, key=key) for s, key in pairs]
+    fitness = [np.asarray(p.returns["reward"][:, 0]) for p in played]
+    order = np.argsort(-fitness[0], kind="stable")
+    np.testing.assert_allclose(states[1].lineage.earned[:E], fitness[0][order[:E]], rtol=1e-6)
+    standing = (np.r_[fitness[0][order[:E]], np.zeros(K - E)] + fitness[1] + fitness[1].mean()) / (
+        np.array([1.0] * E + [0.0] * (K - E)) + 2
+    )
+    assert same(states[2].champion, tree.take(states[1].population, int(np.argmax(standing))))
+    assert rows[1]["fitness_max"] == pytest.approx(float(fitness[1].max()))  # as it was played
+    assert max(states[-1].lineage.times.tolist()) >= 1.0
+
+
 # Breeding, with fitness by hand.
 
 FITNESS = jnp.array([3.0, 0.0, 5.0, 1.0, 4.0, 2.0])

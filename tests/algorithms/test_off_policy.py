@@ -178,7 +178,7 @@ def test_a_policy_that_goes_on_is_tested_at_once():
     ],
 )
 def test_tasks_without_a_gradient_are_refused(build, env, told):
-    with pytest.raises(TypeError, match=told + r".*Evolve without a learner \(credo train ea\)"):
+    with pytest.raises(ValueError, match=told + r".*Evolve without a learner \(credo train ea\)"):
         build(env).init(key=jax.random.key(0))
 
 

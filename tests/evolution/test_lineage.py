@@ -111,3 +111,26 @@ def test_makers_have_names():
     assert MAKERS[CROSSED] == "crossover"
     assert MAKERS[CROSSED_AND_MUTATED] == "crossover and mutation"
     assert MAKERS[INJECTED] == "learner"
+
+
+def test_an_elite_is_judged_by_all_it_had_and_the_lucky_are_believed_half():
+    lineage, standing = Lineage.first(4, 1).judged(jnp.array([8.0, 6.0, 2.0, 0.0]))
+    assert standing.tolist() == [6.0, 5.0, 3.0, 2.0]  # with the mean, 4: the order is the same
+    lineage = lineage.children(
+        index(0, 1), index(0, 1), index(0, 0), flags(0, 0), jnp.zeros(2), flags(1, 1)
+    )
+    assert lineage.earned.tolist() == [8.0, 6.0, 0.0, 0.0]
+    assert lineage.times.tolist() == [1.0, 1.0, 0.0, 0.0]
+    # A hard world: the old elites had bad luck, and a child was lucky.
+    lineage, standing = lineage.judged(jnp.array([0.0, 4.0, 8.0, 0.0]))
+    assert standing.tolist() == pytest.approx([11 / 3, 13 / 3, 5.5, 1.5])
+    lineage, standing = lineage.judged(jnp.array([8.0, 8.0, 0.0, 0.0]))
+    assert standing.tolist() == pytest.approx([20 / 4, 22 / 4, 12 / 3, 4 / 3])
+    guest = lineage.inject(0, 0)
+    assert (float(guest.earned[0]), float(guest.times[0])) == (0.0, 0.0)
+
+
+def test_who_had_no_number_is_nobodys_standard():
+    _, standing = Lineage.first(3, 1).judged(jnp.array([jnp.nan, 2.0, 4.0]))
+    assert standing.tolist()[1:] == [2.5, 3.5]
+    assert jnp.isnan(standing[0])

@@ -217,7 +217,8 @@ def _time_limit(env: gymnasium.Env, limit: int | None) -> int:
     if not limits:
         raise Fault(
             "has no time limit: an episode might never end",
-            "set max_episode_steps, the steps after which an episode is truncated",
+            "set max_episode_steps, the steps after which an episode is truncated: on the command "
+            "line --max-episode-steps 1000, say",
         )
     return min(limits)
 

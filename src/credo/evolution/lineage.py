@@ -16,11 +16,21 @@ class Lineage(eqx.Module):
     """Share of its weights that go back to the first draw and to each learner's actor, mutated
     since or not; after a crossover expected, as if the parents' shares lay everywhere alike."""
     guest: Int[Array, " pop"]  # learner whose actor was put here and not evaluated yet, else -1
+    earned: Float[Array, " pop"]  # sum of what it had in the generations that it lived through
+    times: Float[Array, " pop"]  # how many these were
 
     @classmethod
     def first(cls, pop: int, q: int) -> "Lineage":
         share = jnp.zeros((pop, 1 + q)).at[:, 0].set(1.0)
-        return cls(jnp.full(pop, DRAWN, jnp.int32), share, jnp.full(pop, -1, jnp.int32))
+        nobody, none = jnp.full(pop, -1, jnp.int32), jnp.zeros(pop)
+        return cls(jnp.full(pop, DRAWN, jnp.int32), share, nobody, none, none)
+
+    def judged(self, fitness: Float[Array, " pop"]) -> tuple["Lineage", Float[Array, " pop"]]:
+        """With one more fitness of every member, and the mean of all that each had and of one that
+        is the population's: who was lucky once is believed half."""
+        earned, times = self.earned + fitness, self.times + 1.0
+        after = Lineage(self.maker, self.share, self.guest, earned, times)
+        return after, (earned + jnp.nanmean(fitness)) / (times + 1.0)
 
     def children(
         self,
@@ -44,6 +54,10 @@ class Lineage(eqx.Module):
             jnp.concatenate([self.maker[elites], made]),
             jnp.concatenate([self.share[elites], share]),
             jnp.full_like(self.guest, -1),
+            *(
+                jnp.zeros_like(x).at[: len(elites)].set(x[elites])
+                for x in (self.earned, self.times)
+            ),
         )
 
     def inject(self, slot: int, learner: int) -> "Lineage":
@@ -53,6 +67,8 @@ class Lineage(eqx.Module):
             self.maker.at[slot].set(INJECTED),
             self.share.at[slot].set(own),
             self.guest.at[slot].set(learner),
+            self.earned.at[slot].set(0.0),
+            self.times.at[slot].set(0.0),
         )
 
     def fates(self, elites: Int[Array, " e"], parents: Int[Array, " n"]) -> dict[str, Array]:

@@ -129,6 +129,7 @@ def cell(
     planned: Plan | None = None,
     generations: int | None = None,
     stop_at: float | None = None,
+    first_seed: int = 0,
     **overrides: Any,
 ) -> Cell:
     """Runs of what `build(env, **overrides)` makes, named by label and task."""
@@ -142,7 +143,7 @@ def cell(
     if budget == "smoke":
         algorithm = shrunk(algorithm)
     name = f"{label} {task}" + " delayed" * delayed
-    return Cell(name, algorithm, generations, runs.runs, frames=runs.frames, stop_at=stop_at)
+    return Cell(name, algorithm, generations, runs.runs, first_seed, runs.frames, stop_at)
 
 
 def td3(task: str, budget: str) -> Cell:

@@ -33,6 +33,7 @@ LIMITS = {  # (frames, generations); of 11, 1 and 10 episodes
     "quick": {"erl": (60_000, 200), "ddpg": (60_000, 2_000), "ea": (200_000, 500)},
     "full": {"erl": (1_500_000, 909), "ddpg": (1_500_000, 10_000), "ea": (5_000_000, 2_500)},
 }
+FRESH = 200  # ours was chosen by looking at other seeds of the hard task
 RUNS = {"smoke": 2, "quick": 2, "full": 3, "published": 5}
 GIVEN = {
     "erl": "< 3,000",
@@ -56,6 +57,7 @@ def cells(budget: str) -> list[Cell]:
             planned=Plan(limits[kind][0], RUNS[budget], 2.0 if label == "erl ours" else 1.0),
             generations=limits[kind][1],
             stop_at=SOLVED,
+            first_seed=FRESH if label == "erl ours" else 0,
             test_episodes=10,
         )
         for delayed in (False, True)

@@ -108,7 +108,7 @@ def parse(
 
 def _suggest(argv: list[str], popped: tuple[str, ...]) -> None:
     for token in argv:
-        close = difflib.get_close_matches(token.partition("=")[0], popped, n=1, cutoff=0.75)
+        close = difflib.get_close_matches(token.partition("=")[0], popped, n=1, cutoff=0.8)
         if token.startswith("--") and "." not in token and close:
             print(f"credo: {token}: did you mean {close[0]!r}?", file=sys.stderr)
 

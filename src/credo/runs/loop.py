@@ -407,7 +407,15 @@ def _warm(algorithm: Any, state: PyTree, source: Run) -> PyTree:
             f"{type(algorithm).__name__} cannot start from another run's champion: only an "
             "algorithm with a method `warm(state, policy)` can"
         )
-    policy = checkpoint.import_policy(source.path / "champion.safetensors", state.champion)
+    try:
+        policy = checkpoint.import_policy(source.path / "champion.safetensors", state.champion)
+    except checkpoint.CheckpointError as error:
+        theirs, ours = source.algorithm.network, algorithm.network
+        raise RunError(
+            f"the champion of {source.path} is {theirs} on {source.algorithm.env}, and this run is "
+            f"{ours} on {algorithm.env}: give the same --preset or --network, and a task of the "
+            f"same sizes ({str(error).splitlines()[0]})"
+        ) from error
     return algorithm.warm(state, policy)
 
 
