@@ -30,7 +30,7 @@ measure = chapter6.measure
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:
-    swimmer = [fig_5_3.SWIMMER] if "Swimmer-v5" in chapter5.tasks_in(measured) else []
+    swimmer = [fig_5_3.SWIMMER] if fig_5_3.LONG_VIEW in measured else []
     return [
         *chapter5.by_task(measured),
         chapter5.scores(measured, interval=True),
