@@ -1,4 +1,4 @@
-"""How much code ERL is: its file and everything that it calls."""
+"""How much code ERL is: the functions of its file that run, and everything that they call."""
 
 import ast
 import pathlib
@@ -8,6 +8,7 @@ import jax
 import pytest
 
 import credo
+from credo import rollout
 from credo.algorithms.erl import ERL
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy
@@ -27,6 +28,7 @@ def called(function) -> dict[pathlib.Path, set[int]]:
             found.setdefault(pathlib.Path(code.co_filename), set()).add(code.co_firstlineno)
 
     jax.clear_caches()  # what was compiled before is not traced again
+    rollout._programs.cache_clear()
     sys.setprofile(look)
     try:
         function()

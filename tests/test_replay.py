@@ -158,8 +158,11 @@ def test_too_little_memory_is_told_with_both_numbers(monkeypatch):
 def test_shapes_alone_need_no_memory(monkeypatch):
     """A policy can be read where its run's buffer would not fit."""
     monkeypatch.setattr(replay, "_memory", lambda: 1.0)
-    shapes = eqx.filter_eval_shape(lambda: Replay.empty(ROW, 1000))
+    with replay.shapes_alone():
+        shapes = eqx.filter_eval_shape(lambda: Replay.empty(ROW, 1000))
     assert shapes.data.obs.shape[0] == 1000
+    with pytest.raises(ValueError, match="give a smaller capacity"):
+        jax.jit(lambda: Replay.empty(ROW, 1000))()  # as a run starts
 
 
 def test_this_machine_says_its_memory():

@@ -230,7 +230,8 @@ def _train(argv: list[str]) -> None:
     fields = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     fields |= {"wall_clock": seconds(options.wall_clock), "warm_start": warm_start or None}
     label = _label(names[0], names[1]) + "-delayed" * delayed
-    _note_start(algorithm, options.frames)
+    if not warm_start:
+        _note_start(algorithm, options.frames)
     _guarded(lambda: _start(algorithm, label, **fields))
 
 

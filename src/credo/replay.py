@@ -4,12 +4,14 @@ Written by whole rollouts, of which some rows are padding; read by minibatches. 
 writes donates it: extending 1 GB in place takes milliseconds, copying it half a second.
 """
 
+import contextlib
+import contextvars
 import os
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
@@ -18,6 +20,7 @@ from . import require
 from .compilation import jit
 from .types import Transition
 
+_filled = contextvars.ContextVar("_filled", default=True)
 BLOCK = 1024  # rows that come from the host at a time: one shape, so one program
 
 
@@ -35,16 +38,14 @@ class Replay(eqx.Module):
         """
         require.at_least("capacity", capacity, 1)
         needed, free = capacity * row_bytes(row), _memory()
-        written = jnp.zeros((), jnp.int32)
-        # Shapes alone take no memory: who asks for them only wants to read a policy, say.
-        if needed > free and not isinstance(written, jax.core.Tracer):
+        if needed > free and _filled.get():
             raise ValueError(
                 f"a replay buffer of {capacity:,} transitions needs {needed / 1e9:.1f} GB and this "
                 f"machine has {free / 1e9:.1f} GB: give a smaller capacity, at most "
                 f"{int(free // row_bytes(row)):,}"
             )
         zeros = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), row)
-        return cls(zeros, written)
+        return cls(zeros, jnp.int32(0))
 
     @property
     def capacity(self) -> int:
@@ -75,6 +76,17 @@ class Replay(eqx.Module):
         """`n` rows drawn uniformly with replacement. There must be at least one."""
         index = jax.random.randint(key, (n,), 0, jnp.maximum(self.size, 1))
         return jax.tree.map(lambda x: x[index], self.data)
+
+
+@contextlib.contextmanager
+def shapes_alone() -> Iterator[None]:
+    """Buffers made here are never filled, so they may be larger than the memory: who asks for the
+    shapes of a state may only want to read a policy."""
+    token = _filled.set(False)
+    try:
+        yield
+    finally:
+        _filled.reset(token)
 
 
 def extend(replay: Replay, rows: Transition, valid: Array | None = None) -> Replay:

@@ -131,10 +131,10 @@ def _play(
     states, first = _each(lambda key: env.reset(key=key))(reset_keys)
     carries = _start(population, jax.random.split(policy_key, lanes))
     active = jnp.broadcast_to(jnp.arange(episodes) < wanted, lanes)
-    # Whose policy or world said NaN goes on, has a return of NaN, and is not remembered.
-    lost = jnp.zeros_like(active)
+    # Where policy or world said NaN the episode goes on, has a return of NaN, and is forgotten.
+    lost = active & ~_sound(first.obs)
     totals = (jax.tree.map(jnp.zeros_like, first.rewards), jnp.zeros(lanes, jnp.int32), lost)
-    rows = None
+    rows: Any = None
     if record:
         row = (blank(env), jnp.bool_(False))
         rows = jax.tree.map(lambda x: jnp.zeros((env.max_steps, *lanes, *x.shape), x.dtype), row)
@@ -161,16 +161,19 @@ def _play(
         steps = steps + active.astype(jnp.int32)
         if record:
             ends = (step.terminated, step.truncated)
-            row = (Transition(obs, actions, step.rewards, step.obs, *ends), active & ~lost)
+            row = (Transition(obs, actions, step.rewards, step.obs, *ends), active)
             rows = jax.tree.map(lambda xs, x: xs.at[t].set(x), rows, row)
         active = active & ~(step.terminated | step.truncated)
         return t + 1, states, step.obs, carries, active, (returns, steps, lost), rows
 
     *_, (returns, steps, lost), rows = jax.lax.while_loop(ongoing, advance, start)
     returns = jax.tree.map(lambda x: jnp.where(_over(lost, x), jnp.nan, x), returns)
+    if not record:
+        return Evaluation(returns, steps), None
     # Episode by episode, as they would be met one after the other.
-    flat = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2).reshape(-1, *x.shape[3:]), rows)
-    return Evaluation(returns, steps), Experience(*flat) if record else None
+    kept = (rows[0], rows[1] & ~lost[None])
+    flat = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2).reshape(-1, *x.shape[3:]), kept)
+    return Evaluation(returns, steps), Experience(*flat)
 
 
 def _sound(x: Array) -> Bool[Array, "pop episodes"]:
@@ -202,7 +205,7 @@ def _play_on_host(
     seeds, carry = start(arrays, (pop, episodes), common, key)
     copies = env.copies(pop * episodes)
     active = np.tile(np.arange(episodes) < int(wanted), pop)
-    lost = np.zeros_like(active)  # as in `_play`
+    lost = np.zeros_like(active)  # as in `_play`, by the policy; copies never say NaN
     totals = {name: np.zeros(active.shape) for name in env.signals}
     steps, rows, valid = np.zeros(active.shape, np.int32), [], []
     obs = copies.reset(np.asarray(seeds).reshape(-1), active)
@@ -217,7 +220,7 @@ def _play_on_host(
         steps += active
         if record:
             rows.append((obs, action, step.rewards, step.obs, step.terminated, step.truncated))
-            valid.append(active & ~lost)
+            valid.append(active)
         active = active & ~(step.terminated | step.truncated)
         obs = step.obs
         if not active.any():
@@ -227,7 +230,7 @@ def _play_on_host(
         return jnp.asarray(x.reshape(pop, episodes))
 
     def kept(*xs):
-        x = np.stack(xs, axis=1)[np.stack(valid, axis=1)]
+        x = np.stack(xs, axis=1)[np.stack(valid, axis=1) & ~lost[:, None]]
         return x.astype(np.float32) if x.dtype == np.float64 else x
 
     returns = {

@@ -59,7 +59,7 @@ def cells(budget: str) -> list[Cell]:
                 planned=Plan(frames, runs),
                 network=network,
                 learner=learner,
-                start_frames=start if task == SWING else 1_000,
+                start_frames=min(start if task == SWING else 1_000, frames // 2),
                 test_every=1_000,
             )
             found.append(made)

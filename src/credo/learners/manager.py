@@ -39,7 +39,7 @@ class AbstractManager(eqx.Module):
     memory: eqx.AbstractVar[float]  # α: weight of the newest return, in (0, 1]
 
     def __check_init__(self):
-        if isinstance(self.memory, float) and not 0.0 < self.memory <= 1.0:
+        if isinstance(self.memory, int | float) and not 0.0 < self.memory <= 1.0:
             raise ValueError(f"memory is {self.memory}: it must lie in (0, 1]")
 
     @jit

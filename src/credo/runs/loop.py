@@ -7,7 +7,7 @@ A run is a folder:
     timing.csv           the clock, which is not
     tensorboard/         the same as events
     checkpoints/         everything needed to go on
-    champion.safetensors the best policy, with its config inside
+    champion.safetensors the fittest of the last generation, with its config inside
 """
 
 import contextlib
@@ -32,6 +32,7 @@ from jaxtyping import PRNGKeyArray, PyTree
 from .. import compilation, require
 from ..compilation import jit
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
+from ..replay import shapes_alone
 from . import checkpoint, config, log
 from .budget import Budget
 from .lock import lock
@@ -84,7 +85,8 @@ class Run:
     def champion(self) -> PyTree:
         """The policy with the highest fitness of the last generation; of a learner alone, its
         actor."""
-        like = eqx.filter_eval_shape(self.algorithm.init, key=jax.random.key(0)).champion
+        with shapes_alone():
+            like = eqx.filter_eval_shape(self.algorithm.init, key=jax.random.key(0)).champion
         return checkpoint.import_policy(self.path / "champion.safetensors", like)
 
     def policy(self) -> "Policy":
@@ -410,6 +412,8 @@ def _warm(algorithm: Any, state: PyTree, source: Run) -> PyTree:
     try:
         policy = checkpoint.import_policy(source.path / "champion.safetensors", state.champion)
     except checkpoint.CheckpointError as error:
+        if "does not fit" not in str(error):
+            raise  # it is missing or damaged
         theirs, ours = source.algorithm.network, algorithm.network
         raise RunError(
             f"the champion of {source.path} is {theirs} on {source.algorithm.env}, and this run is "

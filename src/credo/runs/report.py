@@ -36,7 +36,7 @@ def write(paths: list[pathlib.Path], target: pathlib.Path) -> pathlib.Path:
         lead=_lead(runs),
         command="credo report " + shlex.join(map(str, paths)),
         sections=[
-            _figure(runs, "champion_score", "Champion of each generation on fresh episodes"),
+            _figure(runs, "champion_score", "Champion on fresh episodes, as last tested"),
             _figure(runs, "fitness_max", "Best fitness of each generation"),
             _table(runs),
             *_attributions(runs),
@@ -218,7 +218,7 @@ def _table(runs: dict[str, list[Run]]) -> Table:
         )
     episodes = next(iter(runs.values()))[0].config["algorithm"]["test_episodes"]
     return Table(
-        "Score of the last generation's champion",
+        "Score of the champion that was tested last",
         ["runs", "seeds", "generations", "floor", "mean ± s.e.", "median", "ceiling"],
         rows,
         caption=f"On {episodes} fresh episodes; `credo evaluate` plays more.",
