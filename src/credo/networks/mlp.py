@@ -91,6 +91,8 @@ class AbstractCritic(eqx.Module):
 
 
 class AbstractCriticNetwork(eqx.Module):
+    """What `AbstractCritic.init` makes: weights, and how they value state and action."""
+
     action_size: eqx.AbstractVar[int]
 
     @abc.abstractmethod
