@@ -466,3 +466,22 @@ def test_a_delayed_task_pays_in_the_last_row(walkers, env):
     assert np.count_nonzero(after.rewards["reward"]) == POP * EPISODES
     np.testing.assert_array_equal(after.obs, before.obs)
     np.testing.assert_array_equal(after.terminated, before.terminated)
+
+
+@pytest.mark.parametrize("env", [Walk(), HostWalk()], ids=["jax", "host"])
+def test_spread_returns_are_equal_parts_of_what_was_paid(env):
+    """A frame of an episode gets its return over its length; lost episodes leave no frame."""
+    population = tree.stack(*(Constant(jnp.array([a])) for a in (0.5, jnp.nan, 0.9, -0.2)))
+    played, experience = rollout.collect(delayed(env), population, 2, key=jax.random.key(1))
+    spread = experience.spread(played)
+    valid = slice(None) if spread.valid is None else np.asarray(spread.valid)
+    before, reward = (
+        np.asarray(x.transitions.rewards["reward"])[valid] for x in (experience, spread)
+    )
+    kept = [0, 1, 4, 5, 6, 7]
+    steps = np.asarray(played.steps).ravel()[kept]
+    returns = np.asarray(played.returns["reward"]).ravel()[kept]
+    assert len(set(steps)) == 3
+    np.testing.assert_allclose(reward, np.repeat(returns / steps, steps), rtol=1e-6)
+    assert np.count_nonzero(before) == 6  # the task paid at the end of each
+    np.testing.assert_array_equal(spread.transitions.obs, experience.transitions.obs)

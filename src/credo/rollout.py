@@ -25,6 +25,23 @@ class Experience(eqx.Module):
     transitions: Transition  # leaves [rows, ...]
     valid: Bool[Array, " rows"] | None  # None: every row, which then come from the host
 
+    def spread(self, played: Evaluation) -> "Experience":
+        """With every episode's return paid in equal parts over its frames, whenever the task paid
+        it: uniform redistribution (Gangwani et al. 2020; Ren et al. 2022, section 3)."""
+        steps = played.steps.reshape(-1)
+        length = jnp.maximum(steps, 1).astype(jnp.float32)[:, None]
+        frames = max(self.transitions.terminated.shape[0] // steps.size, 1)
+        rewards = {}
+        for name, returns in played.returns.items():
+            share = returns.reshape(steps.size, -1) / length
+            if self.valid is None:  # the episodes, one behind the other, without the lost ones
+                lived = np.where(np.isfinite(share[:, 0]), steps, 0)
+                rows = np.repeat(np.asarray(share), lived, axis=0)
+            else:
+                rows = jnp.repeat(share, frames, axis=0)
+            rewards[name] = rows.reshape(self.transitions.rewards[name].shape)
+        return eqx.tree_at(lambda e: e.transitions.rewards, self, rewards)
+
 
 def evaluate(
     env: Environment,

@@ -43,6 +43,8 @@ class OffPolicy(eqx.Module):
     episodes: int = eqx.field(static=True, default=1)  # played between updates
     start_frames: int = eqx.field(static=True, default=25_000)  # of random actions at first
     updates_per_frame: float = 1.0
+    redistribute: bool = eqx.field(static=True, default=False)
+    """The learner sees each episode's return in equal parts over its frames."""
     test_episodes: int = eqx.field(static=True, default=10)  # without noise; not counted
     test_every: int = eqx.field(static=True, default=5_000)  # frames between tests
     replay_capacity: int = eqx.field(static=True, default=1_000_000)  # transitions
@@ -101,6 +103,7 @@ class OffPolicy(eqx.Module):
         played, experience = collect(
             self.env, tree.stack(explorer), self.episodes, common=False, key=explore_key
         )
+        experience = experience.spread(played) if self.redistribute else experience
         replay = extend(state.replay, experience.transitions, experience.valid)
         new = jnp.sum(played.steps)
         frames = state.frames + new

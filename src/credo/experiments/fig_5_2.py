@@ -1,5 +1,6 @@
 """Figure 5.2: the double pendulum, and the same paid only at the end of an episode."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,14 @@ PUBLISHED = (
 )
 BUDGETS = ("smoke", "quick", "full", "published")
 TASK, SOLVED = "InvertedDoublePendulum-v5", 9000.0  # mean return of the champion's test
+# A test of ten episodes passes champions that fall in every fifth world; runs go on until at most
+# one world of a hundred is lost.
+TEST, STOP = 100, 9200.0
 ALGORITHMS = {
     "erl": ERL.erl,
     "erl ours": ERL.ours,
     "ddpg": OffPolicy.ddpg,
+    "ddpg spread": functools.partial(OffPolicy.ddpg, redistribute=True),
     "ea": ERL.ea,
 }
 # An episode is a few steps long until the task is nearly solved: episodes end most runs, frames
@@ -33,13 +38,14 @@ LIMITS = {  # (frames, generations); of 11, 1 and 10 episodes
     "quick": {"erl": (60_000, 200), "ddpg": (60_000, 2_000), "ea": (200_000, 500)},
     "full": {"erl": (1_500_000, 909), "ddpg": (1_500_000, 10_000), "ea": (5_000_000, 2_500)},
 }
-FRESH = 200  # ours was chosen by looking at other seeds of the hard task
+FRESH = 300  # ours was chosen by looking at other seeds of the hard task
 RUNS = {"smoke": 2, "quick": 2, "full": 3, "published": 5}
 GIVEN = {
     "erl": "< 3,000",
     "ddpg": "< 3,000",
     "ea": "~22,000",
     "erl delayed": "~10,000",
+    "erl ours delayed": "~10,000",
     "ddpg delayed": "fails",
     "ea delayed": "~22,000",
 }
@@ -56,13 +62,14 @@ def cells(budget: str) -> list[Cell]:
             delayed=delayed,
             planned=Plan(limits[kind][0], RUNS[budget], 2.0 if label == "erl ours" else 1.0),
             generations=limits[kind][1],
-            stop_at=SOLVED,
+            stop_at=STOP,
             first_seed=FRESH if label == "erl ours" else 0,
-            test_episodes=10,
+            test_episodes=TEST,
         )
         for delayed in (False, True)
         for label, build in ALGORITHMS.items()
-        for kind in (label.removesuffix(" ours"),)
+        if delayed or not label.endswith(" spread")
+        for kind in (label.partition(" ")[0],)
     ]
 
 
@@ -105,8 +112,10 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         chapter5.about(
             measured,
             "Episodes count those of the whole population and of its learner. A run ends when the "
-            f"mean return of its champion's test reaches {SOLVED:,.0f} (10 episodes), or "
-            "at its limit. DDPG is tested every 5,000 frames only, EA and ERL every generation.",
+            f"mean return of its champion's test reaches {STOP:,.0f} ({TEST} episodes), or "
+            "at its limit. DDPG is tested every 5,000 frames only, EA and ERL every generation. "
+            "Learners of `ours` and `spread` see the return of an episode in equal parts over its "
+            "frames; the task still pays it at the end, and fitness is what the task paid.",
         ),
     ]
 
