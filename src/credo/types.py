@@ -1,6 +1,7 @@
 """The records that cross module borders. Every one is a pytree."""
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 Metrics = dict[str, Array]  # one scalar per name
@@ -36,12 +37,21 @@ class Sequence(eqx.Module):
 class Evaluation(eqx.Module):
     """What a population earned: undiscounted sums of every reward signal."""
 
-    returns: dict[str, Float[Array, "pop episodes"]]
+    returns: dict[str, Float[Array, "pop episodes"]]  # a private one has [agents] behind
     steps: Int[Array, "pop episodes"]  # environment steps taken; padding is not counted
+
+    def of(self, signal: str) -> Float[Array, "pop episodes"]:
+        """The returns of one signal; of a private one the mean over agents."""
+        returns = self.returns[signal]
+        return returns if returns.ndim == 2 else jnp.mean(returns, axis=2)
 
 
 class Transition(eqx.Module):
-    """One frame as learners see it, or rows of them behind a leading axis."""
+    """One frame as learners see it, or rows of them behind a leading axis.
+
+    Of a team it is the joint frame: `obs`, `action`, private rewards and `active` have an axis of
+    agents behind that of the rows.
+    """
 
     obs: Float[Array, "*rows obs"]
     action: Float[Array, "*rows act"]
@@ -49,10 +59,12 @@ class Transition(eqx.Module):
     next_obs: Float[Array, "*rows obs"]
     terminated: Bool[Array, "*rows"]  # the task ended
     truncated: Bool[Array, "*rows"]  # the clock ran out
+    active: Bool[Array, "*rows agents"] | None = None  # whose action counted; None: everybody's
 
 
 class Batch(eqx.Module):
-    """A minibatch for a learner: transitions with the one reward it optimises."""
+    """A minibatch for a learner: transitions with the one reward it optimises. Of a team every
+    entry has an axis of agents behind that of the batch."""
 
     obs: Float[Array, "batch obs"]
     action: Float[Array, "batch act"]
@@ -60,3 +72,4 @@ class Batch(eqx.Module):
     next_obs: Float[Array, "batch obs"]
     terminated: Bool[Array, " batch"]
     truncated: Bool[Array, " batch"]
+    active: Bool[Array, "batch agents"] | None = None

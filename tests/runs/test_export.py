@@ -9,7 +9,7 @@ import pytest
 from safetensors import safe_open
 
 from credo.algorithms.neuroevolution import Neuroevolution
-from credo.environments import worker
+from credo.environments import adapters
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.sequence_recall import SequenceRecall
 from credo.environments.wrappers import DelayedHostReward
@@ -103,7 +103,7 @@ def test_without_reset_a_recurrent_network_remembers(tmp_path):
 def test_actions_are_those_that_the_worker_gives_the_environment(tmp_path, space):
     run = made(tmp_path / "run", DelayedHostReward(plant(space)), MLP((5,)))
     policy, act = run.policy(), Runner.load(export(run, tmp_path / "p.safetensors"))
-    _, read = worker._actions(Plant.spaces[space])
+    _, read = adapters._actions(Plant.spaces[space])
     expected = [read(policy(obs)[None])[0] for obs in observations()]
     actions = [act(obs) for obs in observations()]
     assert all(Plant.spaces[space].contains(action) for action in actions)

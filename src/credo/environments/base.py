@@ -30,11 +30,24 @@ class AbstractEnvironment(eqx.Module):
         action_size: eqx.AbstractVar[int]
         max_steps: eqx.AbstractVar[int]  # no episode is longer
         signals: eqx.AbstractVar[tuple[str, ...]]
-        """Names of the rewards. The first is what training maximises and the last is what is
-        reported, unless an algorithm says otherwise."""
+        """Names of the rewards. The first is what training maximises, unless an algorithm says
+        otherwise; the last is what is reported, unless the task does."""
     agents: ClassVar[int | None] = None
+    discrete: ClassVar[bool] = False
     obs_range: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
     """The least and the largest number in an observation."""
+
+    @property
+    def reported(self) -> str:
+        """The reward signal by which a champion is judged."""
+        return self.signals[-1]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Numbers in an observation and in an action, and of a team how many agents: what networks
+        and learners are made for."""
+        team = () if self.agents is None else (self.agents,)
+        return self.obs_size, self.action_size, *team
 
     @abc.abstractmethod
     def reset(self, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:

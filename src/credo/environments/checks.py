@@ -333,7 +333,8 @@ def _check_host(env: AbstractHostEnvironment) -> list[str]:
     if a != d or b != c:
         problems.append(
             "the same seed gave two different episodes: draw everything from self.np_random, which "
-            "reset(seed=seed) seeds through super().reset(seed=seed), and let reset set all state"
+            "reset(seed=seed) seeds (a gymnasium.Env does by super().reset(seed=seed)), and let "
+            "reset set all state"
         )
     return problems
 
@@ -346,14 +347,15 @@ def _play_host(
     What is wrong is added to `problems`; at the first wrong step it stops.
     """
     random, active = np.random.default_rng(0), np.ones(copies.n, bool)
+    obs_size, action_size, *team = env.sizes
     obs = copies.reset(seeds, active)
-    problems += _numbers("reset: obs", obs, (copies.n, env.obs_size), np.float32)
+    problems += _numbers("reset: obs", obs, (copies.n, *team, obs_size), np.float32)
     seen = [obs[i].tobytes() for i in range(copies.n)] if not problems else []
     for _ in range(min(env.max_steps, HOST_STEPS)):
         if problems or not active.any():
             return seen
-        action = np.clip(random.uniform(-1.5, 1.5, env.action_size), -1.0, 1.0)
-        step = copies.step(np.tile(np.float32(action), (copies.n, 1)), active)
+        action = np.clip(random.uniform(-1.5, 1.5, (1, *team, action_size)), -1.0, 1.0)
+        step = copies.step(np.repeat(np.float32(action), copies.n, axis=0), active)
         problems += _host_step(env, step, active)
         for i in np.flatnonzero(active) if not problems else ():
             rewards = [step.rewards[name][i].tobytes() for name in env.signals]
@@ -368,22 +370,29 @@ def _play_host(
 
 
 def _host_step(env: AbstractHostEnvironment, step: HostStep, active: np.ndarray) -> list[str]:
-    n = len(active)
-    problems = _numbers("step: obs", step.obs, (n, env.obs_size), np.float32, active)
+    n, (obs_size, _, *team) = len(active), env.sizes
+    problems = _numbers("step: obs", step.obs, (n, *team, obs_size), np.float32, active)
     if set(step.rewards) != set(env.signals):
         problems.append(
             f"step: rewards are {sorted(step.rewards)} but signals names {sorted(env.signals)}: "
             "return exactly those, every time"
         )
     for name, reward in step.rewards.items():
-        problems += _numbers(f"step: reward {name!r}", reward, (n,), np.floating, active)
+        shape = (n, *env.reward_shapes.get(name, ()))
+        problems += _numbers(f"step: reward {name!r}", reward, shape, np.floating, active)
     for name in ("terminated", "truncated"):
         problems += _numbers(f"step: {name}", getattr(step, name), (n,), np.bool_)
+    if team:
+        problems += _numbers("step: active", step.active, (n, *team), np.bool_)
     return problems
 
 
 def _numbers(
-    what: str, x: np.ndarray, shape: tuple[int, ...], dtype: type, active: np.ndarray | None = None
+    what: str,
+    x: np.ndarray | None,
+    shape: tuple[int, ...],
+    dtype: type,
+    active: np.ndarray | None = None,
 ) -> list[str]:
     """Problems of one NumPy array whose `active` rows should be finite."""
     name = "a floating type" if dtype is np.floating else np.dtype(dtype).name

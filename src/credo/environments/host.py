@@ -17,6 +17,10 @@ class EnvironmentFailure(RuntimeError):
     """
 
 
+class UnfitEnvironment(EnvironmentFailure, ValueError):
+    """What was named cannot be opened as a task: id, kwargs, spaces or time limit do not fit."""
+
+
 def failure_of(play: Callable[[], Any]) -> EnvironmentFailure | None:
     """How an environment fails while it is played, for checks that list what is wrong."""
     try:
@@ -29,12 +33,18 @@ def failure_of(play: Callable[[], Any]) -> EnvironmentFailure | None:
 @dataclasses.dataclass
 class HostStep:
     """What `n` copies say after one step, in arrays of its own that no later step writes to. Rows
-    of copies that were not active are finite and mean nothing."""
+    of copies that were not active are finite and mean nothing.
 
-    obs: Float[np.ndarray, "n obs"]
-    rewards: dict[str, Float[np.ndarray, " n"]]
+    For a team, observations and private rewards have an axis of agents, and `active` says who acts
+    at the next step. An agent that leaves has its last reward and observation in that very step;
+    while it is away both are 0.
+    """
+
+    obs: Float[np.ndarray, "n *agents obs"]
+    rewards: dict[str, Float[np.ndarray, "n *agents"]]
     terminated: Bool[np.ndarray, " n"]  # the task ended: do not bootstrap
     truncated: Bool[np.ndarray, " n"]  # the clock ran out: do bootstrap
+    active: Bool[np.ndarray, "n agents"] | None = None
 
 
 class AbstractCopies(abc.ABC):
@@ -46,11 +56,13 @@ class AbstractCopies(abc.ABC):
     def reset(self, seeds: UInt32[np.ndarray, " n"], active: Bool[np.ndarray, " n"]) -> np.ndarray:
         """A fresh episode in every active copy; its seed decides all that is random in it.
 
-        **Returns:** observations `[n, obs]`, float32.
+        **Returns:** observations `[n, obs]`, of a team `[n, agents, obs]`, float32.
         """
 
     @abc.abstractmethod
-    def step(self, actions: Float[np.ndarray, "n act"], active: Bool[np.ndarray, " n"]) -> HostStep:
+    def step(
+        self, actions: Float[np.ndarray, "n *agents act"], active: Bool[np.ndarray, " n"]
+    ) -> HostStep:
         """One step of every active copy; the others cost nothing. Actions lie in [-1, 1]."""
 
 
@@ -69,6 +81,22 @@ class AbstractHostEnvironment(eqx.Module):
         signals: eqx.AbstractVar[tuple[str, ...]]  # names of the rewards, as in a JAX task
     agents: ClassVar[int | None] = None
     discrete: ClassVar[bool] = False  # the largest of an action's entries is taken
+
+    @property
+    def reported(self) -> str:
+        """The reward signal by which a champion is judged."""
+        return self.signals[-1]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """As of a JAX task: numbers in an observation and in an action, of a team the agents."""
+        team = () if self.agents is None else (self.agents,)
+        return self.obs_size, self.action_size, *team
+
+    @property
+    def reward_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of each reward of one copy: () or, of one that is private to each agent, (agents,)."""
+        return dict.fromkeys(self.signals, ())
 
     @abc.abstractmethod
     def copies(self, n: int) -> AbstractCopies:

@@ -129,6 +129,7 @@ class Meet(AbstractEnvironment):
     action_size: ClassVar[int] = 1
     max_steps: ClassVar[int] = 5
     signals: ClassVar[tuple[str, ...]] = ("global", "local")
+    reported: ClassVar[str] = "global"
     obs_range: ClassVar[tuple[float, float]] = (-4.0, 4.0)
 
     def reset(self, *, key: PRNGKeyArray) -> tuple[MeetState, TimeStep]:

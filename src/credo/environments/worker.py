@@ -1,4 +1,4 @@
-"""Copies of a Gymnasium environment in a process of their own, and the pipe to it.
+"""Copies of an environment of others in a process of their own, and the pipe to it.
 
 `python -m credo.environments.worker` imports the standard library, NumPy, Gymnasium and the
 environment: no JAX. `Process` starts one and speaks to it; `Environments` is what it holds.
@@ -8,9 +8,8 @@ and for faults; nothing is unpickled. Needs pipes and signals as Unix has them.
 
 import array
 import contextlib
-import functools
-import importlib
 import json
+import math
 import mmap
 import os
 import select
@@ -22,82 +21,89 @@ import tempfile
 import threading
 import time
 import traceback
-import warnings
-from collections.abc import Callable
 from typing import Any
 
-import gymnasium
 import numpy as np
+
+from .adapters import APIS, Fault
 
 HEADER = struct.Struct("=II")  # kind, bytes that follow
 OPEN, RESET, STEP, FRAME, FAULT = range(5)
 GRACE = 2.0  # seconds that environments get to close themselves
 
 
-class Fault(Exception):
-    """What an environment did wrong (`what`), and what to do about it (`fix`)."""
-
-    def __init__(self, what: str, fix: str):
-        super().__init__(what, fix)
-        self.what, self.fix = what, fix
-
-
 class Frame:
-    """What `n` copies say, as arrays that look into the bytes of one message."""
+    """What `n` copies say, as arrays that look into the bytes of one message.
 
-    def __init__(self, n: int, obs_size: int):
-        obs = HEADER.size + 8 * n
-        flags = obs + 4 * n * obs_size
-        self.buffer = bytearray(flags + 2 * n)
+    For a team rewards and observations have an axis of agents, and `active` says who acts next.
+    """
+
+    def __init__(self, n: int, obs_size: int, agents: int | None):
+        rows = n * (agents or 1)
+        team = (n,) if agents is None else (n, agents)
+        obs = HEADER.size + 8 * rows
+        flags = obs + 4 * rows * obs_size
+        self.buffer = bytearray(flags + 2 * n + (0 if agents is None else rows))
         HEADER.pack_into(self.buffer, 0, FRAME, len(self.buffer) - HEADER.size)
-        self.rewards = np.ndarray(n, np.float64, self.buffer, HEADER.size)
-        self.obs = np.ndarray((n, obs_size), np.float32, self.buffer, obs)
+        self.rewards = np.ndarray(team, np.float64, self.buffer, HEADER.size)
+        self.obs = np.ndarray((*team, obs_size), np.float32, self.buffer, obs)
         self.terminated = np.ndarray(n, np.bool_, self.buffer, flags)
         self.truncated = np.ndarray(n, np.bool_, self.buffer, flags + n)
+        self.active = None
+        if agents is not None:
+            self.active = np.ndarray(team, np.bool_, self.buffer, flags + 2 * n)
 
 
 class Environments:
     """`n` copies in this process, behind flat arrays. Raises `Fault`, and nothing else.
 
-    `spec` has `id`, `kwargs` (a dict) and `max_episode_steps` (a number or None). `current[0]` is
-    the copy that is being called: it may lie in memory shared with whoever must know.
+    `spec` has `id`, `kwargs` (a dict), `max_episode_steps` (a number or None) and, if it is not
+    Gymnasium's, `api`. `current[0]` is the copy that is being called: it may lie in memory shared
+    with whoever must know.
     """
 
     def __init__(self, spec: dict[str, Any], n: int, current: Any = None):
         self.current = array.array("i", [0]) if current is None else current
         self.n, self._envs = n, []
+        api = APIS[spec.get("api", "gymnasium")]
         with _blaming("look at its id and kwargs, and whether its package is installed"):
             for i in range(n):
                 self.current[0] = i
-                self._envs.append(_make(spec))
-        self.max_steps = _time_limit(self._envs[0], spec["max_episode_steps"])
-        self.obs_size, self._write = _observations(self._envs[0].observation_space)
-        self.action_size, self._read = _actions(self._envs[0].action_space)
-        self.discrete = isinstance(self._envs[0].action_space, gymnasium.spaces.Discrete)
+                self._envs.append(api.make(spec))
+            self._api = api(self._envs[0], spec["max_episode_steps"])
+        self.obs_size, self.action_size = self._api.obs_size, self._api.action_size
+        self.agents, self.max_steps = self._api.agents, self._api.max_steps
+        self.discrete = self._api.discrete
         self._steps = [-1] * n  # in this episode; -1: there is none
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> Frame:
         """Seeds `[n]`, uint32; active `[n]`."""
-        frame = Frame(self.n, self.obs_size)
+        frame = Frame(self.n, self.obs_size, self.agents)
         with _blaming():
             for i in active.nonzero()[0].tolist():
                 self.current[0] = i
-                result = self._envs[i].reset(seed=int(seeds[i]))
-                _count(result, 2, "reset", "(observation, info)")
-                self._write(result[0], frame.obs[i])
+                self._api.reset(self._envs[i], int(seeds[i]), frame, i)
                 self._steps[i] = 0
         self._finite(frame)
         return frame
 
     def step(self, actions: np.ndarray, active: np.ndarray) -> Frame:
-        """Actions `[n, act]` in [-1, 1], clipped to it; active `[n]`."""
-        frame = Frame(self.n, self.obs_size)
+        """Actions `[n, act]`, of a team `[n, agents, act]`, in [-1, 1], clipped to it; active
+        `[n]`."""
+        frame = Frame(self.n, self.obs_size, self.agents)
         with _blaming():
             self._given(actions, active)
-            own = self._read(actions)
+            own, step, steps = self._api.read(actions), self._api.step, self._steps
             for i in active.nonzero()[0].tolist():
                 self.current[0] = i
-                self._step(i, own[i], frame)
+                if steps[i] < 0:
+                    raise Fault("was asked for a step outside an episode", "reset this copy first")
+                over = step(self._envs[i], own[i], frame, i)
+                steps[i] += 1
+                if steps[i] >= self.max_steps:
+                    frame.truncated[i] = over = True
+                if over:
+                    steps[i] = -1
         self._finite(frame)
         return frame
 
@@ -108,31 +114,14 @@ class Environments:
             self.current[0] = i
             if not np.isfinite(actions[i]).all():
                 told = "look at the policy: NaN and inf are no actions"
-                raise Fault(f"was given the action {actions[i]}", told)
-
-    def _step(self, i: int, action: Any, frame: Frame) -> None:
-        if self._steps[i] < 0:
-            raise Fault("was asked for a step outside an episode", "reset this copy first")
-        result = self._envs[i].step(action)
-        _count(result, 5, "step", "(observation, reward, terminated, truncated, info)")
-        obs, reward, terminated, truncated, _ = result
-        self._write(obs, frame.obs[i])
-        if not isinstance(reward, (float, int)) and np.shape(reward) != ():
-            raise Fault(f"returned the reward {reward!r}", "return one number")
-        frame.rewards[i] = reward
-        frame.terminated[i] = terminated
-        frame.truncated[i] = truncated
-        self._steps[i] += 1
-        if self._steps[i] >= self.max_steps:
-            frame.truncated[i] = truncated = True
-        if terminated or truncated:
-            self._steps[i] = -1
+                raise Fault(f"was given the action {actions[i].tolist()}", told)
 
     def _finite(self, frame: Frame) -> None:
         """One look at all copies; rows of those that are not active are 0."""
         if np.isfinite(frame.obs).all() and np.isfinite(frame.rewards).all():
             return
-        good = np.isfinite(frame.obs).all(axis=1) & np.isfinite(frame.rewards)
+        obs, rewards = (x.reshape(self.n, -1) for x in (frame.obs, frame.rewards))
+        good = np.isfinite(obs).all(axis=1) & np.isfinite(rewards).all(axis=1)
         self.current[0] = i = int(np.flatnonzero(~good)[0])
         told = "the reward" if np.isfinite(frame.obs[i]).all() else "an observation"
         raise Fault(
@@ -140,8 +129,8 @@ class Environments:
             "guard the division, root or logarithm it is from, or end the episode before",
         )
 
-    def sizes(self) -> dict[str, int]:
-        names = ("obs_size", "action_size", "max_steps", "discrete")
+    def sizes(self) -> dict[str, Any]:
+        names = ("obs_size", "action_size", "max_steps", "discrete", "agents")
         return {name: getattr(self, name) for name in names}
 
     usable = True
@@ -167,127 +156,6 @@ class _blaming:
         place = traceback.extract_tb(trace)[-1]
         what = f"raised {kind.__name__}: {error} ({place.filename}:{place.lineno})"
         raise Fault(what, self.fix) from error
-
-
-def _make(spec: dict[str, Any]) -> gymnasium.Env:
-    """One environment, by its Gymnasium id, as `package.module:Class`, or by an id that a module
-    registers when it is imported: `package.module:Name-v0`."""
-    module, _, name = spec["id"].partition(":")
-    cls = getattr(importlib.import_module(module), name, None) if name.isidentifier() else None
-    if cls is None:
-        if name:
-            importlib.import_module(module)
-        return _registered(**spec | {"id": name or module})
-    _hear_mujoco()
-    env = cls(**spec["kwargs"])
-    if not isinstance(env, gymnasium.Env):
-        raise Fault(f"is a {type(env).__name__}", "name a class derived from gymnasium.Env")
-    return env
-
-
-def _registered(id: str, kwargs: dict[str, Any], max_episode_steps: int | None) -> gymnasium.Env:
-    with warnings.catch_warnings():  # -v4 tasks are asked for on purpose
-        warnings.filterwarnings("ignore", r".*is out of date", DeprecationWarning)
-        entry = gymnasium.spec(id).entry_point
-        if isinstance(entry, str):
-            importlib.import_module(entry.partition(":")[0])
-        _hear_mujoco()
-        return gymnasium.make(id, max_episode_steps, disable_env_checker=True, **kwargs)
-
-
-def _hear_mujoco() -> None:
-    """MuJoCo would write its warnings to a file in the working directory, once for every copy."""
-    mujoco = sys.modules.get("mujoco")
-    if mujoco is not None and mujoco.get_mju_user_warning() is None:
-        mujoco.set_mju_user_warning(_tell)
-
-
-@functools.cache  # each once
-def _tell(warning: str) -> None:
-    if "'settotalmass' is deprecated" not in warning:  # in Gymnasium's half_cheetah.xml
-        print(f"MuJoCo: {warning}", file=sys.stderr)
-
-
-def _time_limit(env: gymnasium.Env, limit: int | None) -> int:
-    limits = [] if limit is None else [limit]
-    while isinstance(env, gymnasium.Wrapper):
-        if isinstance(env, gymnasium.wrappers.TimeLimit):
-            limits.append(env._max_episode_steps)
-        env = env.env
-    if not limits:
-        raise Fault(
-            "has no time limit: an episode might never end",
-            "set max_episode_steps, the steps after which an episode is truncated: on the command "
-            "line --max-episode-steps 1000, say",
-        )
-    return min(limits)
-
-
-def _observations(space: gymnasium.Space) -> tuple[int, Callable[[Any, np.ndarray], None]]:
-    """Size of a flat observation, and how to write one into a row of float32.
-
-    Box: flattened. Discrete: one-hot. What is made of them: one after the other.
-    """
-    shape = space.shape
-
-    def write_box(obs: Any, row: np.ndarray) -> None:
-        obs = np.asarray(obs)
-        if obs.shape != shape:
-            raise Fault(
-                f"returned an observation of shape {obs.shape}",
-                f"its observation_space says {shape}: make the two agree",
-            )
-        row[:] = obs.ravel()
-
-    def write_other(obs: Any, row: np.ndarray) -> None:
-        if not space.contains(obs):
-            raise Fault(
-                f"returned the observation {obs!r}",
-                f"its observation_space is {space}: make the two agree",
-            )
-        row[:] = gymnasium.spaces.flatten(space, obs)
-
-    if not space.is_np_flattenable:
-        raise Fault(
-            f"has the observation space {space}",
-            "use a Box, a Discrete, or a Dict or Tuple of them",
-        )
-    box = isinstance(space, gymnasium.spaces.Box)
-    return gymnasium.spaces.flatdim(space), write_box if box else write_other
-
-
-def _actions(space: gymnasium.Space) -> tuple[int, Callable[[np.ndarray], np.ndarray]]:
-    """Size of an action, and how to turn actions `[n, act]` in [-1, 1] into the space's own.
-
-    Box: -1 is its low, 1 its high. Discrete: the entry that is largest.
-    """
-    if isinstance(space, gymnasium.spaces.Discrete):
-        start = space.start
-        return int(space.n), lambda actions: np.argmax(actions, axis=1) + start
-    if not isinstance(space, gymnasium.spaces.Box):
-        raise Fault(f"has the action space {space}", "use a Box or a Discrete")
-    low, high = (np.float64(bound).ravel() for bound in (space.low, space.high))
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise Fault(
-            f"has an action space without bounds: {space}",
-            "give its Box a finite low and high: actions in [-1, 1] are scaled to them",
-        )
-    center, half = (low + high) / 2, (high - low) / 2
-    shape, dtype = space.shape, space.dtype
-    whole = not np.issubdtype(dtype, np.floating)
-
-    def read(actions: np.ndarray) -> np.ndarray:
-        own = np.minimum(np.maximum(center + half * actions, low), high)
-        own = np.rint(own) if whole else own
-        return own.astype(dtype).reshape(-1, *shape)
-
-    return low.size, read
-
-
-def _count(result: Any, n: int, where: str, parts: str) -> None:
-    if not (isinstance(result, tuple) and len(result) == n):
-        count = f"{len(result)} values" if isinstance(result, tuple) else type(result).__name__
-        raise Fault(f"returned {count} from {where}", f"return {parts}")
 
 
 def _message(kind: int, value: dict[str, Any]) -> bytes:
@@ -323,7 +191,7 @@ class Process:
         self._sizes = json.loads(reply[HEADER.size :])
         self.obs_size, self.action_size = self._sizes["obs_size"], self._sizes["action_size"]
 
-    def sizes(self) -> dict[str, int]:
+    def sizes(self) -> dict[str, Any]:
         return self._sizes
 
     @property
@@ -337,7 +205,7 @@ class Process:
         return self._call(STEP, actions, active)
 
     def _call(self, kind: int, numbers: np.ndarray, active: np.ndarray) -> Frame:
-        frame = Frame(self.n, self.obs_size)
+        frame = Frame(self.n, self.obs_size, self._sizes["agents"])
         payload = numbers.tobytes() + active.tobytes()
         self._ask(HEADER.pack(kind, len(payload)) + payload, frame.buffer)
         return frame
@@ -454,8 +322,9 @@ def _answer(environments: Environments, kind: int, payload: bytes) -> Frame:
     active = np.frombuffer(payload, np.bool_, n, len(payload) - n)
     if kind == RESET:
         return environments.reset(np.frombuffer(payload, np.uint32, n), active)
-    actions = np.frombuffer(payload, np.float32, n * environments.action_size)
-    return environments.step(actions.reshape(n, -1), active)
+    shape = (n, environments.agents or 1, environments.action_size)
+    actions = np.frombuffer(payload, np.float32, math.prod(shape)).reshape(shape)
+    return environments.step(actions if environments.agents else actions[:, 0], active)
 
 
 def _watch(parent: int) -> None:

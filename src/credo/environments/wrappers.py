@@ -85,6 +85,10 @@ class DelayedReward(AbstractEnvironment):
         return self.env.agents
 
     @property
+    def reported(self) -> str:
+        return self.env.reported
+
+    @property
     def obs_range(self) -> tuple[float, float]:
         return self.env.obs_range
 
@@ -136,17 +140,25 @@ class DelayedHostReward(AbstractHostEnvironment):
     def discrete(self) -> bool:
         return self.env.discrete
 
+    @property
+    def reported(self) -> str:
+        return self.env.reported
+
+    @property
+    def reward_shapes(self) -> dict[str, tuple[int, ...]]:
+        return self.env.reward_shapes
+
     def copies(self, n: int) -> "DelayedCopies":
         inner = self.env.copies(n)
         if (self, n) not in _DELAYED or _DELAYED[self, n].inner is not inner:
-            _DELAYED[self, n] = DelayedCopies(inner, self.signals)
+            _DELAYED[self, n] = DelayedCopies(inner, self.reward_shapes)
         return _DELAYED[self, n]
 
 
 class DelayedCopies(AbstractCopies):
-    def __init__(self, inner: AbstractCopies, signals: tuple[str, ...]):
+    def __init__(self, inner: AbstractCopies, shapes: dict[str, tuple[int, ...]]):
         self.inner, self.n = inner, inner.n
-        self._earned = {name: np.zeros(inner.n) for name in signals}
+        self._earned = {name: np.zeros((inner.n, *shape)) for name, shape in shapes.items()}
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
         for earned in self._earned.values():
@@ -158,9 +170,10 @@ class DelayedCopies(AbstractCopies):
         ended = now.terminated | now.truncated
         paid = {}
         for name, earned in self._earned.items():
-            np.add(earned, now.rewards[name], out=earned, where=active)
-            paid[name] = np.where(ended & active, earned, 0.0)
-        return HostStep(now.obs, paid, now.terminated, now.truncated)
+            lanes = (-1,) + (1,) * (earned.ndim - 1)
+            np.add(earned, now.rewards[name], out=earned, where=active.reshape(lanes))
+            paid[name] = np.where((ended & active).reshape(lanes), earned, 0.0)
+        return HostStep(now.obs, paid, now.terminated, now.truncated, now.active)
 
 
 _DELAYED: dict[tuple[DelayedHostReward, int], DelayedCopies] = {}

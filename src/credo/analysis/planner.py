@@ -1,0 +1,414 @@
+"""Floors and ceilings of the rover domain: what a share of observed POIs is worth.
+
+Floors act by the sensors alone: random actions, straight lines, and a greedy team that heads for
+the POI it sees closest. Ceilings know all positions: a scripted team whose share was really
+achieved, and an upper bound that no policy whatsoever can pass. Between the two lies the best
+policy for that world.
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+import operator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+
+from ..compilation import jit
+from ..environments.rover import BRACKETS, CODED_SPEED, Rover, RoverState
+from ..networks.base import AbstractPolicy
+
+EXHAUSTIVE = 4  # POIs up to which every division among the groups is tried
+KEPT = 16  # plans per world that are played in the environment
+STATES = 100_000  # coverages of the POIs that the exact bound may tell apart
+AROUND = 24  # meeting points per POI that a plan chooses from
+
+
+class RandomTeam(AbstractPolicy):
+    """Every rover draws a uniform action at every step."""
+
+    agents: int = eqx.field(static=True)
+    amplitude: float = 1.0  # the largest action, in [0, 1]
+
+    def start(self, *, key: PRNGKeyArray) -> PRNGKeyArray:
+        return key
+
+    def __call__(self, obs: Float[Array, "agents obs"], carry: PRNGKeyArray):
+        carry, key = jax.random.split(carry)
+        drawn = jax.random.uniform(key, (self.agents, 2), minval=-1.0, maxval=1.0)
+        return self.amplitude * drawn, carry
+
+
+class StraightLines(AbstractPolicy):
+    """Every rover draws one heading and drives there."""
+
+    agents: int = eqx.field(static=True)
+    coded: bool = eqx.field(static=True, default=False)  # the motion is "as-coded"
+    drive: float = 1.0  # share of the full speed, in [0, 1]
+
+    def start(self, *, key: PRNGKeyArray) -> Float[Array, " agents"]:
+        """The turn in radians that is left to make."""
+        return jax.random.uniform(key, (self.agents,), minval=-math.pi, maxval=math.pi)
+
+    def __call__(self, obs: Float[Array, "agents obs"], carry: Float[Array, " agents"]):
+        made = _possible(carry, self.coded)
+        return _action(made, jnp.full(self.agents, self.drive), self.coded), carry - made
+
+
+class GreedyTeam(AbstractPolicy):
+    """Every rover heads for the POI that it sees closest, and straight on if it sees none.
+
+    It turns to the middle of the bracket and halts at the POI. Needs the "relative" observation.
+    """
+
+    max_speed: float  # m per step
+    coded: bool = eqx.field(static=True, default=False)  # the motion is "as-coded"
+
+    def start(self, *, key: PRNGKeyArray) -> None:
+        return None
+
+    def __call__(self, obs: Float[Array, "agents obs"], carry: None):
+        seen = obs[:, BRACKETS : 2 * BRACKETS]
+        strength = jnp.max(seen, axis=1)
+        bracket = jnp.argmax(seen, axis=1).astype(jnp.float32)
+        turn = _wrapped((bracket + 0.5) * (2 * math.pi / BRACKETS))
+        distance = 1.0 / jnp.maximum(strength, 1e-6) - 1.0
+        turn = jnp.where(strength > 0, turn, 0.0)
+        drive = jnp.minimum(1.0, distance / self.max_speed)
+        return _action(_possible(turn, self.coded), drive, self.coded), carry
+
+
+def random_team(env: Rover) -> RandomTeam:
+    """The floor of random actions for the rovers of `env`."""
+    return RandomTeam(env.agents)
+
+
+def straight_lines(env: Rover) -> StraightLines:
+    """The floor of straight lines for the rovers of `env`."""
+    return StraightLines(env.agents, env.motion == "as-coded")
+
+
+def greedy_team(env: Rover) -> GreedyTeam:
+    """The greedy floor for `env`; ValueError unless its observation is "relative"."""
+    if env.observation != "relative":
+        raise ValueError(
+            f"observation is {env.observation!r}: the greedy team reads brackets around its own "
+            "heading; give a Rover(observation='relative')"
+        )
+    return GreedyTeam(env.max_speed, env.motion == "as-coded")
+
+
+def starts(env: Rover, worlds: int, *, key: PRNGKeyArray) -> RoverState:
+    """Start states of that many worlds; leaves `[worlds, ...]`."""
+    return _reset(env, jax.random.split(key, worlds))
+
+
+def play_team(
+    env: Rover, states: RoverState, team: AbstractPolicy, *, key: PRNGKeyArray
+) -> Float[Array, " worlds"]:
+    """Global reward, in [0, 1], of a policy `(obs, carry) -> (action, carry)` from each start."""
+    keys = jax.random.split(key, states.step.shape[0])
+    return _play_team(_global(env), states, team, keys)
+
+
+def scripted_team(env: Rover, states: RoverState) -> Float[np.ndarray, " worlds"]:
+    """Global reward, in [0, 1], that a team with full knowledge achieved from each start.
+
+    It forms floor(rovers / coupling) groups, at most as many as POIs, and spare rovers join them.
+    Up to 4 POIs every division among the groups in every order is rated by the way to go, and the
+    best 16 are played in the environment; beyond, each POI in turn goes to the group that gets
+    there first. A group drives to the near side of its next POI and waits there for all its rovers.
+    Groups never mix, so where time is short a better team may exist; the bound says how much.
+    """
+    rovers, poi = (np.asarray(x, np.float64) for x in (states.position, states.poi))
+    plans = [_plan(env, *world) for world in zip(rovers, poi, strict=True)]
+    table = Plans(*(jnp.asarray(np.stack(parts)) for parts in zip(*plans, strict=True)))
+    return np.asarray(_play_plans(_global(env), states, table)).max(axis=1)
+
+
+def upper_bound(env: Rover, state: RoverState) -> float:
+    """A share of the global reward, in [0, 1], that no policy can pass from this start.
+
+    Proof. Who was within d_a of POI a and later of POI b has driven at least |ab| - 2·d_a between,
+    and |sa| - d_a from its start s to the first: where the sum over a sequence of POIs exceeds
+    `max_steps` times the highest speed, no rover visits them in that sequence, so each rover visits
+    one of the sets for which some sequence remains. An observed POI was visited by `coupling`
+    rovers or more, so the observed ones are covered that often by one choice of such a set per
+    rover, and the greatest value over all choices bounds the reward. Where there are too many
+    POIs for that the sets are forgotten, and each POI counts that `coupling` rovers reach alone.
+
+    With `graded` each POI counts d_a / max(d_a, m): m is the mean over its `coupling` closest
+    rovers of how near each could come at all. The mean at any step is no smaller, and an observed
+    POI has m <= d_a.
+    """
+    position, poi = (np.asarray(x, np.float64) for x in (state.position, state.poi))
+    values = np.asarray(env.values, np.float64)
+    d_a = float(env.activation_distance)
+    range_ = _speed(env) * env.max_steps * (1 + 1e-5) + 1e-4  # beyond the rounding of float32
+    way = _distances(position, poi)
+    if env.graded:
+        nearest = np.sort(np.maximum(way - range_, 0.0), axis=0)[: env.coupling].mean(axis=0)
+        return min(1.0, float(values @ (d_a / np.maximum(d_a, nearest))))
+    if (env.coupling + 1) ** env.pois > STATES:
+        reached = (way - d_a <= range_).sum(axis=0) >= env.coupling
+        return min(1.0, float(values @ reached))
+    between = np.maximum(_distances(poi, poi) - 2 * d_a, 0.0)
+    sets = [_visitable(np.maximum(row - d_a, 0.0), between, range_) for row in way]
+    return min(1.0, _best_cover(sets, values, env.coupling))
+
+
+def floors_and_ceilings(
+    env: Rover, worlds: int = 100, *, draws: int = 10, key: PRNGKeyArray
+) -> list[dict[str, float]]:
+    """One row per world: the global reward of each floor, of the script, and the upper bound.
+
+    **Arguments:** `draws`: games per world that "random" and "straight" are the mean of.
+    **Returns:** rows with the keys random, straight, greedy (if `env` has the "relative"
+    observation), scripted and bound, all in [0, 1].
+    """
+    start_key, random_key, straight_key, greedy_key = jax.random.split(key, 4)
+    states = starts(env, worlds, key=start_key)
+    columns = {}
+    floors = (("random", random_team, random_key), ("straight", straight_lines, straight_key))
+    for name, team, team_key in floors:
+        games = [
+            play_team(env, states, team(env), key=draw)
+            for draw in jax.random.split(team_key, draws)
+        ]
+        columns[name] = np.mean(games, axis=0)
+    if env.observation == "relative":
+        columns["greedy"] = play_team(env, states, greedy_team(env), key=greedy_key)
+    columns["scripted"] = scripted_team(env, states)
+    worlds_ = [jax.tree.map(operator.itemgetter(i), states) for i in range(worlds)]
+    columns["bound"] = [upper_bound(env, world) for world in worlds_]
+    return [{name: float(x[i]) for name, x in columns.items()} for i in range(worlds)]
+
+
+# Acting
+
+
+def _wrapped(angle: Float[Array, " agents"]) -> Float[Array, " agents"]:
+    """The same direction within half a turn, rad."""
+    return angle - 2 * math.pi * jnp.round(angle / (2 * math.pi))
+
+
+def _possible(turn: Float[Array, " agents"], coded: bool) -> Float[Array, " agents"]:
+    """How much of a turn one step can make, rad."""
+    most = 0.5 * math.pi if coded else math.pi
+    return jnp.clip(turn, -most, most)
+
+
+def _action(turn: Float[Array, " agents"], drive: Float[Array, " agents"], coded: bool):
+    """The action for a possible turn in rad and a share of the full speed."""
+    if coded:
+        return jnp.stack([2.0 * drive - 1.0, turn / (0.5 * math.pi)], axis=1)
+    return jnp.stack([turn / math.pi, 2.0 * drive - 1.0], axis=1)
+
+
+def _speed(env: Rover) -> float:
+    return CODED_SPEED if env.motion == "as-coded" else float(env.max_speed)
+
+
+def _global(env: Rover) -> Rover:
+    """The same world that computes only the global reward."""
+    return dataclasses.replace(env, rewards=("global",))
+
+
+@jit
+def _reset(env: Rover, keys: PRNGKeyArray) -> RoverState:
+    return jax.vmap(lambda key: env.reset(key=key)[0])(keys)
+
+
+def _simulate(env: Rover, start: RoverState, act, carry: PyTree) -> Float[Array, ""]:
+    """Global reward of one episode of `act(state, obs, carry) -> (action, carry)`."""
+
+    def ongoing(loop):
+        return ~(loop[1].terminated | loop[1].truncated)
+
+    def advance(loop):
+        state, now, carry = loop
+        action, carry = act(state, now.obs, carry)
+        return *env.step(state, action, key=jax.random.key(0)), carry  # a step draws nothing
+
+    begun = env.begin(start.position, start.heading, start.poi)
+    _, last, _ = jax.lax.while_loop(ongoing, advance, (*begun, carry))
+    return last.rewards["global"]
+
+
+@jit
+def _play_team(env: Rover, states: RoverState, team: AbstractPolicy, keys: PRNGKeyArray):
+    def one(state, key):
+        return _simulate(env, state, lambda _, obs, carry: team(obs, carry), team.start(key=key))
+
+    return jax.vmap(one)(states, keys)
+
+
+# Planning
+
+
+class Plans(eqx.Module):
+    """Who goes where in one world; a row per plan."""
+
+    route: Int[Array, "plans groups pois"]  # POIs in the order of the visits, -1 behind the last
+    aim: Float[Array, "plans groups pois 2"]  # where the group meets for each of them, m
+    group: Int[Array, "plans rovers"]
+
+
+@jit
+def _play_plans(env: Rover, states: RoverState, plans: Plans) -> Float[Array, "worlds plans"]:
+    def follow(state: RoverState, plan: Plans):
+        open_ = (plan.route >= 0) & ~state.observed[plan.route]
+        next_ = jnp.argmax(open_, axis=1)
+        aim = plan.aim[jnp.arange(plan.route.shape[0]), next_]
+        busy = jnp.any(open_, axis=1)[plan.group]
+        way = aim[plan.group] - state.position
+        turn = _wrapped(jnp.arctan2(way[:, 1], way[:, 0]) - state.heading)
+        drive = jnp.minimum(1.0, jnp.sqrt(jnp.sum(way**2, axis=1)) / env.max_speed)
+        coded = env.motion == "as-coded"
+        turn = _possible(jnp.where(busy, turn, 0.0), coded)
+        return _action(turn, jnp.where(busy, drive, 0.0), coded)
+
+    def one(state, plan):
+        return _simulate(env, state, lambda state, obs, carry: (follow(state, plan), carry), ())
+
+    return jax.vmap(lambda state, plans: jax.vmap(lambda p: one(state, p))(plans))(states, plans)
+
+
+def _plan(env: Rover, rovers: Float[np.ndarray, "rovers 2"], poi: Float[np.ndarray, "pois 2"]):
+    """The plans for one world that are worth playing: the fields of `Plans`."""
+    groups = min(env.agents // env.coupling, env.pois)
+    way = np.linalg.norm(poi - rovers.mean(axis=0), axis=1)
+    if env.pois > EXHAUSTIVE:
+        chosen = _nearest_next(groups, way, _distances(poi, poi))[None]
+    else:
+        routes = _divisions(groups, env.pois)
+        chosen = routes[_best(env, routes, way, _distances(poi, poi))]
+    made = [_lay_out(env, route, rovers, poi) for route in chosen]
+    aim, group = (np.stack(x) for x in zip(*made, strict=True))
+    return chosen, aim.astype(np.float32), group
+
+
+@functools.lru_cache(maxsize=32)
+def _divisions(groups: int, pois: int) -> Int[np.ndarray, "plans groups pois"]:
+    """Every division of the POIs among the groups in every order, -1 behind the last."""
+    plans = []
+    for order in itertools.permutations(range(pois)):
+        for cuts in itertools.combinations_with_replacement(range(pois + 1), groups - 1):
+            edges = (0, *cuts, pois)
+            parts = [order[a:b] for a, b in itertools.pairwise(edges)]
+            plans.append([(*part, *[-1] * (pois - len(part))) for part in parts])
+    return np.array(plans, np.int32)
+
+
+def _best(env: Rover, routes, way, between) -> Int[np.ndarray, " plans"]:
+    """The plans that get to the most value in time and, among these, are done first."""
+    d_a = float(env.activation_distance)
+    there = routes >= 0
+    leg = np.concatenate(
+        [way[routes[..., :1]] - d_a, between[routes[..., :-1], routes[..., 1:]] - 2 * d_a], axis=-1
+    )
+    arrival = np.cumsum(np.where(there, np.maximum(leg, 0.0), 0.0), axis=-1)
+    in_time = there & (arrival <= _speed(env) * env.max_steps)
+    value = (np.asarray(env.values)[routes] * in_time).sum(axis=(1, 2)).round(5)
+    done = arrival.max(axis=(1, 2))
+    return np.lexsort((done, -value))[:KEPT]
+
+
+def _nearest_next(groups: int, way, between) -> Int[np.ndarray, "groups pois"]:
+    """One plan: the group that gets to an unassigned POI first takes it, until none is left."""
+    pois = len(way)
+    route, visited = np.full((groups, pois), -1, np.int32), np.zeros(groups, int)
+    arrival = np.tile(way, (groups, 1))  # of each group at each POI, as its next one
+    for _ in range(pois):
+        group, poi = np.unravel_index(np.argmin(arrival), arrival.shape)
+        route[group, visited[group]] = poi
+        visited[group] += 1
+        taken = np.isinf(arrival[group])
+        arrival[group] = np.where(taken, np.inf, arrival[group, poi] + between[poi])
+        arrival[:, poi] = np.inf
+    return route
+
+
+def _lay_out(env: Rover, route, rovers, poi):
+    """Meeting points `[groups, pois, 2]` of a plan, and the group of each rover."""
+    centre = rovers.mean(axis=0)
+    first = np.where(route[:, :1] >= 0, poi[route[:, 0]], centre[None])
+    group = _join(_distances(rovers, first), env.coupling)
+    # Who cannot halt circles within 0.75 m of the point.
+    d_a = float(env.activation_distance)
+    radius = max(d_a - 0.75, 0.0) if env.motion == "as-coded" else 0.95 * d_a
+    angle = np.arange(AROUND) * (2 * math.pi / AROUND)
+    ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    aim = np.zeros((*route.shape, 2))
+    for g, pois in enumerate(route):
+        here = rovers[group == g].mean(axis=0)
+        for k, p in enumerate(pois[pois >= 0]):
+            choices = poi[p] + ring
+            detour = np.linalg.norm(choices - here, axis=1)
+            if k + 1 < len(pois) and pois[k + 1] >= 0:
+                detour += np.linalg.norm(choices - poi[pois[k + 1]], axis=1)
+            here = aim[g, k] = choices[np.argmin(detour)]
+    return aim, group
+
+
+def _join(way: Float[np.ndarray, "rovers groups"], members: int) -> Int[np.ndarray, " rovers"]:
+    """The group of each rover: `members` each, by who gains most from it; the rest anywhere."""
+    rovers, groups = way.shape
+    group, left = np.full(rovers, -1, np.int32), np.full(groups, members)
+    gain = way - way.mean(axis=1, keepdims=True)
+    for rover, g in zip(*np.unravel_index(np.argsort(gain, axis=None), way.shape), strict=True):
+        if group[rover] < 0 and left[g] > 0:
+            group[rover], left[g] = g, left[g] - 1
+    return np.where(group < 0, np.argmin(way, axis=1), group).astype(np.int32)
+
+
+# Bounding
+
+
+def _distances(
+    a: Float[np.ndarray, "a 2"], b: Float[np.ndarray, "b 2"]
+) -> Float[np.ndarray, "a b"]:
+    return np.linalg.norm(a[:, None] - b[None], axis=2)
+
+
+def _visitable(first: np.ndarray, between: np.ndarray, range_: float) -> list[int]:
+    """The largest sets of POIs, as bits, that one rover has the range for.
+
+    **Arguments:** `first` `[pois]` and `between` `[pois, pois]`: metres at least to a POI.
+    """
+    pois = len(first)
+    shortest = np.full((2**pois, pois), np.inf)  # of the sequences of a set that end at a POI
+    shortest[2 ** np.arange(pois), np.arange(pois)] = first
+    for visited in range(1, 2**pois):
+        for poi in range(pois):
+            if not visited >> poi & 1:
+                grown = visited | 1 << poi
+                way = (shortest[visited] + between[:, poi]).min()
+                shortest[grown, poi] = min(shortest[grown, poi], way)
+    able = [visited for visited in range(2**pois) if shortest[visited].min() <= range_]
+    return [a for a in able if not any(a != b and a & b == a for b in able)]
+
+
+def _best_cover(sets: list[list[int]], values: np.ndarray, coupling: int) -> float:
+    """The greatest value of POIs that lie in `coupling` sets or more, one set per rover."""
+    pois = len(values)
+    counts = np.zeros((coupling + 1,) * pois, bool)
+    counts[(0,) * pois] = True  # reachable numbers of visitors, more than `coupling` as `coupling`
+    for choices in sets:
+        reached = np.zeros_like(counts) if choices else counts
+        for chosen in choices:
+            grown = counts
+            for poi in range(pois):
+                if chosen >> poi & 1:
+                    before = np.moveaxis(grown, poi, 0)
+                    after = np.zeros_like(before)
+                    after[1:] = before[:-1]
+                    after[-1] |= before[-1]
+                    grown = np.moveaxis(after, 0, poi)
+            reached = reached | grown
+        counts = reached
+    return float(((np.argwhere(counts) >= coupling) @ values).max())

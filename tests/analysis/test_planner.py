@@ -1,0 +1,199 @@
+"""Floors, scripts and bounds of the rover domain."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from credo import rollout
+from credo.analysis.planner import (
+    floors_and_ceilings,
+    greedy_team,
+    play_team,
+    random_team,
+    scripted_team,
+    starts,
+    straight_lines,
+    upper_bound,
+)
+from credo.environments.rover import Rover
+
+SCARCE = Rover(coupling=2, max_steps=5)  # too short to get everywhere
+
+
+def start(env, rovers, pois):
+    heading = jnp.zeros(env.agents)
+    return env.begin(jnp.asarray(rovers, jnp.float32), heading, jnp.asarray(pois, jnp.float32))[0]
+
+
+def bounds(env, states):
+    worlds = states.step.shape[0]
+    return np.array(
+        [upper_bound(env, jax.tree.map(lambda x, i=i: x[i], states)) for i in range(worlds)]
+    )
+
+
+@pytest.fixture(scope="module")
+def scarce():
+    states = starts(SCARCE, 100, key=jax.random.key(0))
+    return states, bounds(SCARCE, states), scripted_team(SCARCE, states)
+
+
+@pytest.mark.parametrize("coupling", [1, 4, 7])
+def test_with_full_knowledge_every_poi_is_observed(coupling):
+    env = Rover(coupling=coupling)
+    states = starts(env, 40, key=jax.random.key(coupling))
+    assert scripted_team(env, states).mean() >= 0.99
+
+
+def test_so_it_is_as_coded():
+    env = Rover(coupling=3, motion="as-coded", start="as-coded")
+    states = starts(env, 40, key=jax.random.key(0))
+    assert scripted_team(env, states).mean() >= 0.99
+
+
+def test_the_motivating_example_has_a_solution_that_greed_misses():
+    env = Rover.motivating()
+    states = starts(env, 8, key=jax.random.key(0))
+    assert (bounds(env, states) == 1.0).all()
+    assert (scripted_team(env, states) == 1.0).all()
+    greedy = play_team(env, states, greedy_team(env), key=jax.random.key(1))
+    assert (np.asarray(greedy) == 0.5).all()  # both at POI 1
+    # Rover 1 alone reaches POI 1 only.
+    alone = start(Rover(rovers=1, pois=2, coupling=1, **MOTIVATING), [(14, 17)], POIS)
+    assert upper_bound(Rover(rovers=1, pois=2, coupling=1, **MOTIVATING), alone) == 0.5
+    # Rover 0 could reach either, but not both.
+    alone = start(Rover(rovers=1, pois=2, coupling=1, **MOTIVATING), [(9, 10)], POIS)
+    assert upper_bound(Rover(rovers=1, pois=2, coupling=1, **MOTIVATING), alone) == 0.5
+
+
+MOTIVATING = {"activation_distance": 2.0, "max_steps": 30, "max_speed": 0.5}
+POIS = [(1, 1), (1, 18)]
+
+
+def test_more_than_four_pois_go_to_whoever_is_there_first():
+    env = Rover(coupling=2, pois=9, max_steps=80)
+    states = starts(env, 20, key=jax.random.key(0))
+    assert scripted_team(env, states).mean() >= 0.95
+
+
+def test_nobody_passes_the_bound(scarce):
+    states, bound, scripted = scarce
+    assert (scripted <= bound + 1e-6).all()
+    assert 0.2 < bound.mean() < 0.8
+    assert np.mean(scripted > bound - 1e-6) > 0.2  # where they agree both are exact
+    for team in (random_team, straight_lines, greedy_team):
+        for seed in range(5):
+            share = play_team(SCARCE, states, team(SCARCE), key=jax.random.key(seed))
+            assert (np.asarray(share) <= bound + 1e-6).all()
+
+
+def test_the_bound_by_hand():
+    env = Rover(rovers=2, pois=2, coupling=1, activation_distance=1.0, max_steps=8)
+    # 9 - 1 = 8 m to either side: one each.
+    pois = [(9, 0), (-9, 0)]
+    assert upper_bound(env, start(env, [(0, 0), (0, 0)], pois)) == 1.0
+    both = dataclasses.replace(env, coupling=2)  # the pair has to choose
+    assert upper_bound(both, start(both, [(0, 0), (0, 0)], pois)) == 0.5
+    worth = dataclasses.replace(both, poi_values=(1.0, 3.0))
+    assert upper_bound(worth, start(worth, [(0, 0), (0, 0)], pois)) == 0.75
+    assert upper_bound(both, start(both, [(0, 0), (-0.1, 0)], pois)) == 0.5
+    assert upper_bound(both, start(both, [(0.1, 0), (-0.1, 0)], pois)) == 0.0
+    # One after the other: 3 - 1 to the first and 8 - 2 to the next make 8.
+    line = [(3, 0), (11, 0)]
+    assert upper_bound(both, start(both, [(0, 0), (0, 0)], line)) == 1.0
+    assert upper_bound(both, start(both, [(-0.1, 0), (0, 0)], line)) == 0.5
+
+
+def brute_force(env, position, poi):
+    """The same bound by trying every choice of one sequence of POIs per rover."""
+    d_a, values, range_ = env.activation_distance, np.ones(env.pois) / env.pois, env.max_steps
+    tours = []
+    for rover in position:
+        sets = set()
+        for length in range(env.pois + 1):
+            for order in itertools.permutations(range(env.pois), length):
+                stops = [poi[p] for p in order]
+                way = sum(
+                    max(np.linalg.norm(b - a) - k * d_a, 0)
+                    for a, b, k in zip([rover, *stops], stops, [1] + [2] * length, strict=False)
+                )
+                if way <= range_:
+                    sets.add(frozenset(order))
+        tours.append(sets)
+    best = 0.0
+    for choice in itertools.product(*tours):
+        visits = np.array([sum(p in chosen for chosen in choice) for p in range(env.pois)])
+        best = max(best, values @ (visits >= env.coupling))
+    return best
+
+
+def test_the_bound_agrees_with_brute_force():
+    env = Rover(rovers=4, pois=3, coupling=2, max_steps=5)
+    states = starts(env, 30, key=jax.random.key(1))
+    expected = [
+        brute_force(env, np.float64(position), np.float64(poi))
+        for position, poi in zip(states.position, states.poi, strict=True)
+    ]
+    np.testing.assert_allclose(bounds(env, states), expected, atol=1e-6)
+    assert len(np.unique(np.round(expected, 3))) >= 3
+
+
+def test_many_pois_have_the_bound_of_each_alone():
+    env = Rover(rovers=4, pois=20, coupling=2, max_steps=6)
+    states = starts(env, 20, key=jax.random.key(0))
+    bound = bounds(env, states)
+    way = np.linalg.norm(
+        np.asarray(states.position)[:, :, None] - np.asarray(states.poi)[:, None], axis=-1
+    )
+    alone = np.mean(np.sum(way - 3.0 <= 6.0, axis=1) >= 2, axis=1)
+    np.testing.assert_allclose(bound, alone, atol=1e-6)
+    assert (scripted_team(env, states) <= bound + 1e-6).all()
+    assert 0.1 < bound.mean() < 0.95
+
+
+def test_graded_bound():
+    env = Rover(rovers=2, pois=1, coupling=2, graded=True, max_steps=4)
+    state = start(env, [(0, 0), (2, 0)], [(15, 0)])
+    # At best 15 - 4 and 13 - 4 metres away.
+    assert upper_bound(env, state) == pytest.approx(3 / 10, rel=1e-4)
+    one = jax.tree.map(lambda x: x[None], state)
+    assert scripted_team(env, one)[0] == pytest.approx(3 / 10, rel=1e-3)
+
+
+def test_lines_are_straight_and_greed_reads_the_sensors():
+    env = Rover(rovers=2, pois=1, coupling=2, max_steps=5)
+    team = straight_lines(env)
+    carry = team.start(key=jax.random.key(0))
+    first, carry = team(jnp.zeros((2, 72)), carry)
+    second, _ = team(jnp.zeros((2, 72)), carry)
+    assert abs(float(first[0, 0] - first[1, 0])) > 1e-3
+    assert first[:, 1].tolist() == second[:, 1].tolist() == [1.0, 1.0]
+    assert second[:, 0].tolist() == [0.0, 0.0]
+    obs = jnp.zeros((2, 72)).at[0, 36 + 9].set(1 / 5).at[0, 36 + 20].set(1 / 1.5)
+    greedy, _ = greedy_team(env)(obs, None)
+    np.testing.assert_allclose(greedy[0], [-155 / 180, 0.0], atol=1e-6)  # half a metre there
+    np.testing.assert_allclose(greedy[1], [0.0, 1.0], atol=1e-6)
+    with pytest.raises(ValueError, match="observation is 'as-coded'"):
+        greedy_team(Rover(observation="as-coded"))
+
+
+def test_floors_are_policies_like_any_other():
+    env = Rover(rovers=4, pois=2, coupling=2, max_steps=30, rewards=("local", "global"))
+    teams = (random_team, straight_lines, greedy_team)
+    shares = [rollout.score(env, team(env), 20, key=jax.random.key(0)) for team in teams]
+    assert max(shares[:2]) < 0.5
+    assert shares[2] > 0.8
+
+
+def test_a_row_per_world(scarce):
+    rows = floors_and_ceilings(SCARCE, 30, draws=2, key=jax.random.key(0))
+    assert len(rows) == 30
+    assert all(list(row) == ["random", "straight", "greedy", "scripted", "bound"] for row in rows)
+    mean = {name: np.mean([row[name] for row in rows]) for name in rows[0]}
+    assert mean["random"] < mean["greedy"] <= mean["bound"]
+    assert mean["scripted"] <= mean["bound"]
+    assert mean["bound"] == pytest.approx(scarce[1].mean(), abs=0.15)
