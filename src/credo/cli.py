@@ -49,6 +49,19 @@ ALGORITHMS = {
         }.items()
     },
 }
+ALGORITHMS["merl"] = Entry(
+    "credo.algorithms.merl:MERL",
+    "merl",
+    None,
+    "teams: evolution on the common goal, gradient on each agent's own reward (Algorithm 13)",
+)
+ALGORITHMS |= {
+    name: Entry("credo.algorithms.off_policy:OffPolicy", name, None, text)
+    for name, text in {
+        "matd3": "TD3 for teams, with critics that see the whole team",
+        "maddpg": "DDPG for teams, with critics that see the whole team",
+    }.items()
+}
 ALGORITHMS["ppo"] = Entry(
     "credo.algorithms.ppo:PPO", "ppo", None, "proximal policy optimization, on fresh frames alone"
 )
@@ -61,8 +74,18 @@ TASKS = {
         "credo.environments.sequence_recall:SequenceRecall",
         "hear directions, take them in order: deep T-maze (3.3)",
     ),
+    "rover": (
+        "credo.environments.rover:Rover",
+        "teams look for points of interest, n rovers at once to see one (7.4)",
+    ),
+    "simple-spread": (
+        "credo.environments.simple_spread:SimpleSpread",
+        "a team covers landmarks: mpe2.simple_spread_v3 in JAX",
+    ),
 }
 GYMNASIUM = "credo.environments.gymnasium:Gymnasium"  # any other task, by its id there
+PARALLEL = "pettingzoo.utils.env.ParallelEnv"
+PETTINGZOO = "credo.environments.pettingzoo:PettingZoo"  # or a team of PettingZoo
 NETWORKS = {
     "mmu": ("credo.networks.mmu:MMU", {}, "gated memory (equations 3.1-3.5)"),
     "rnn": ("credo.networks.recurrent:Recurrent", {"cell": "rnn"}, "Elman network"),
@@ -96,6 +119,8 @@ EXPERIMENTS = {
     "fig-6.5": "CERL against its parts on four tasks",
     "table-6.1": "workers of each learner",
     "beyond-6": "SAC and a critic of 2024 beside TD3, and three managers",
+    "fig-7.1": "two rovers and a local reward that misleads",
+    "fig-7.4": "rover domain, coupling 1 to 7",
 }
 PRESETS = {
     "as-written": "Algorithm 2 as printed (the default)",
@@ -174,8 +199,9 @@ def _list(argv: list[str]) -> None:
             print(f"  {name:<{width}}{text}")
     if not argv or argv[0] == "tasks":
         print("  Hopper-v5, …            any task that Gymnasium knows and whose actions are a box")
+        print("  mpe2.simple_spread_v3   any team of PettingZoo (ParallelEnv) with Box actions")
         print("  package.module:Class    a task of your own (see examples/own_environment.py), or")
-        print("                          a gymnasium.Env class")
+        print("                          a gymnasium.Env or pettingzoo.ParallelEnv class")
 
 
 @dataclasses.dataclass
@@ -242,6 +268,7 @@ usage: credo train ALGORITHM TASK [--network NAME] [--preset NAME] [--delayed] [
 algorithms: {", ".join(ALGORITHMS)}
 tasks:      {", ".join(TASKS)}
             or one of Gymnasium, such as Hopper-v5
+            or a team of PettingZoo, such as mpe2.simple_spread_v3
             or package.module:Class
 networks:   {", ".join(NETWORKS)} (default: the algorithm's own)
 presets:    {", ".join(PRESETS)} (default: as-written), of neuroevolution
@@ -479,6 +506,8 @@ def _task(name: str) -> Any:
         return _load(TASKS[name][0])()
     if re.fullmatch(r"\w+(\.\w+)*:\w+", name):
         return _own_task(name)
+    if re.fullmatch(r"\w+(\.\w+)+", name):  # a module with parallel_env
+        return _load(PETTINGZOO)(id=name)
     import gymnasium
 
     module, _, registered = name.rpartition(":")
@@ -509,6 +538,10 @@ def _own_task(name: str) -> Any:
 
     if isinstance(cls, type) and issubclass(cls, gymnasium.Env):
         return _load(GYMNASIUM)(id=name)
+    if any(
+        f"{base.__module__}.{base.__name__}" == PARALLEL for base in getattr(cls, "__mro__", ())
+    ):
+        return _load(PETTINGZOO)(id=name)
     ours = (AbstractEnvironment, AbstractHostEnvironment)
     if not (isinstance(cls, type) and issubclass(cls, ours)):
         fail(f"{name} is no task: derive it from credo.AbstractEnvironment or gymnasium.Env")

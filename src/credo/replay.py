@@ -72,10 +72,26 @@ class Replay(eqx.Module):
         data = jax.tree.map(lambda old, new: old.at[slot].set(new, mode="drop"), self.data, rows)
         return Replay(data, self.written + n)
 
-    def sample(self, n: int, *, key: PRNGKeyArray) -> Transition:
-        """`n` rows drawn uniformly with replacement. There must be at least one."""
-        index = jax.random.randint(key, (n,), 0, jnp.maximum(self.size, 1))
+    def sample(self, n: int, *, together: bool = False, key: PRNGKeyArray) -> Transition:
+        """`n` rows drawn uniformly with replacement. There must be at least one.
+
+        Of a team all leaves get an axis of agents, `[n, agents, ...]`. Each agent has rows of its
+        own, as from a buffer of its own, unless they are drawn `together`.
+        """
+        team = self.data.action.shape[1:-1]
+        index = jax.random.randint(
+            key, (n,) if together else (n, *team), 0, jnp.maximum(self.size, 1)
+        )
+        if team:
+            return self._of_team(index)
         return jax.tree.map(lambda x: x[index], self.data)
+
+    def _of_team(self, index: Int[Array, "n *agents"]) -> Transition:
+        """Each agent's part of its own row; what all share is repeated."""
+        n, agents = len(index), self.data.action.shape[1]
+        index = jnp.broadcast_to(index.reshape(n, -1), (n, agents))
+        every = jnp.arange(agents)
+        return jax.tree.map(lambda x: x[index] if x.ndim == 1 else x[index, every], self.data)
 
 
 @contextlib.contextmanager

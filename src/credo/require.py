@@ -28,12 +28,45 @@ def signal(given: str | None, known: tuple[str, ...]) -> None:
         raise ValueError(f"no reward signal {given!r}: this task has {', '.join(known)}")
 
 
-def trainable(env: Any) -> None:
-    """A task that gradient learners can be trained on: one agent, Box actions."""
-    if env.agents is not None or getattr(env, "discrete", False):
-        has = "Discrete actions" if env.agents is None else f"{env.agents} agents"
+def fits(env: Any, network: Any, *learners: Any) -> None:
+    """A network that acts for as many agents as the task has, and learners that can learn it."""
+    team = env.agents is not None
+    if network.team != team:
+        raise ValueError(_other_team(env, network))
+    if learners and (env.discrete or (team and not all(learner.teams for learner in learners))):
+        raise ValueError(_cannot_learn(env, learners))
+
+
+def _other_team(env: Any, network: Any) -> str:
+    task, name = getattr(env, "id", type(env).__name__), type(network).__name__
+    if network.team:
+        return f"{name} acts for a team and {task} has one agent: give a network of one, MLP(...)"
+    return (
+        f"{name} acts for one agent and {task} has {env.agents}: put it on a team, as in "
+        f"Team(head={name}(...))"
+    )
+
+
+def _cannot_learn(env: Any, learners: tuple[Any, ...]) -> str:
+    has = "Discrete actions" if env.discrete else f"{env.agents} agents"
+    return (
+        f"{getattr(env, 'id', type(env).__name__)} has {has}: "
+        f"{', '.join(type(x).__name__ for x in learners)} cannot learn that. Evolve without a "
+        "learner (credo train ea), or give a task with Box actions; teams learn by TD3 (credo "
+        "train merl, matd3)"
+    )
+
+
+def room(elite_fraction: float, population: int, learners: int, workers: int) -> None:
+    """A population with elites, and slots for the actors of learners that all play."""
+    within("elite_fraction", elite_fraction, 0, 1)
+    if not 1 <= int(elite_fraction * population) <= population - max(1, learners):
         raise ValueError(
-            f"{getattr(env, 'id', type(env).__name__)} has {has}: learners follow the gradient of "
-            "one agent's continuous actions. Evolve without a learner (credo train ea), or give a "
-            "task of one agent with Box actions"
+            f"elite_fraction is {elite_fraction} of {population} members: that must be at least 1, "
+            f"and leave {max(1, learners)} slots for offspring"
+        )
+    if workers < learners:
+        raise ValueError(
+            f"{workers} workers for {learners} learners: some would never play; give at least as "
+            "many"
         )

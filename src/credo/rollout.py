@@ -44,12 +44,7 @@ class Experience(eqx.Module):
 
 
 def evaluate(
-    env: Environment,
-    population: PyTree,
-    episodes: int,
-    *,
-    common: bool = True,
-    key: PRNGKeyArray,
+    env: Environment, population: PyTree, episodes: int, *, common: bool = True, key: PRNGKeyArray
 ) -> Evaluation:
     """Play `episodes` episodes with every member of a population.
 
@@ -89,22 +84,21 @@ def score(
 ) -> Float[Array, ""]:
     """Mean return of one policy on fresh episodes, of the signal that the task reports."""
     played = evaluate(env, tree.stack(policy), episodes, key=key)
-    return jnp.mean(played.returns[env.signals[-1]])
+    return jnp.mean(played.of(env.reported))
 
 
 def blank(env: Environment) -> Transition:
     """A transition of this task, all zeros: its shapes and types."""
+    obs_size, action_size, *team = env.sizes
+    obs, action, ended = jnp.zeros((*team, obs_size)), jnp.zeros((*team, action_size)), jnp.bool_(0)
     if isinstance(env, AbstractHostEnvironment):
-        obs = jnp.zeros(env.obs_size)
-        rewards = {name: jnp.float32(0.0) for name in env.signals}
-        ended = jnp.bool_(False)
-        return Transition(obs, jnp.zeros(env.action_size), rewards, obs, ended, ended)
-    _, first = jax.eval_shape(lambda: env.reset(key=jax.random.key(0)))
-    team = () if env.agents is None else (env.agents,)
-    first = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), first)
-    action = jnp.zeros((*team, env.action_size))
-    ends = (first.terminated, first.truncated)
-    return Transition(first.obs, action, first.rewards, first.obs, *ends)
+        rewards = {name: jnp.zeros(shape) for name, shape in env.reward_shapes.items()}
+        active = jnp.zeros(team, bool) if team else None
+    else:
+        _, first = jax.eval_shape(lambda: env.reset(key=jax.random.key(0)))
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), first)
+        rewards, active = zeros.rewards, zeros.active
+    return Transition(obs, action, rewards, obs, ended, ended, active)
 
 
 def world_keys(pop: int, episodes: int, common: bool, *, key: PRNGKeyArray) -> PRNGKeyArray:
@@ -155,14 +149,14 @@ def _play(
     if record:
         row = (blank(env), jnp.bool_(False))
         rows = jax.tree.map(lambda x: jnp.zeros((env.max_steps, *lanes, *x.shape), x.dtype), row)
-    start = (jnp.int32(0), states, first.obs, carries, active, totals, rows)
+    start = (jnp.int32(0), states, (first.obs, first.active), carries, active, totals, rows)
 
     def ongoing(loop):
         t, _, _, _, active, _, _ = loop
         return jnp.any(active) & (t < env.max_steps)
 
     def advance(loop):
-        t, states, obs, carries, active, (returns, steps, lost), rows = loop
+        t, states, (obs, acting), carries, active, (returns, steps, lost), rows = loop
         actions, carries = _act(population, obs, carries)
         sound = _sound(actions)
         actions = jnp.where(jnp.isfinite(actions), actions, 0.0)
@@ -178,10 +172,11 @@ def _play(
         steps = steps + active.astype(jnp.int32)
         if record:
             ends = (step.terminated, step.truncated)
-            row = (Transition(obs, actions, step.rewards, step.obs, *ends), active)
+            row = (Transition(obs, actions, step.rewards, step.obs, *ends, acting), active)
             rows = jax.tree.map(lambda xs, x: xs.at[t].set(x), rows, row)
         active = active & ~(step.terminated | step.truncated)
-        return t + 1, states, step.obs, carries, active, (returns, steps, lost), rows
+        seen = (step.obs, step.active)
+        return t + 1, states, seen, carries, active, (returns, steps, lost), rows
 
     *_, (returns, steps, lost), rows = jax.lax.while_loop(ongoing, advance, start)
     returns = jax.tree.map(lambda x: jnp.where(_over(lost, x), jnp.nan, x), returns)
@@ -198,7 +193,7 @@ def _sound(x: Array) -> Bool[Array, "pop episodes"]:
     return jnp.all(jnp.isfinite(x).reshape(*x.shape[:2], -1), axis=2)
 
 
-def _over(lanes: Bool[Array, "pop episodes"], x: Array) -> Bool[Array, "..."]:
+def _over(lanes: Any, x: Any) -> Any:
     """`lanes` for `x` that may have an axis of agents behind."""
     return lanes.reshape(lanes.shape + (1,) * (x.ndim - lanes.ndim))
 
@@ -223,38 +218,38 @@ def _play_on_host(
     copies = env.copies(pop * episodes)
     active = np.tile(np.arange(episodes) < int(wanted), pop)
     lost = np.zeros_like(active)  # as in `_play`, by the policy; copies never say NaN
-    totals = {name: np.zeros(active.shape) for name in env.signals}
+    totals = {name: np.zeros((active.size, *shape)) for name, shape in env.reward_shapes.items()}
     steps, rows, valid = np.zeros(active.shape, np.int32), [], []
+    acting = None if env.agents is None else np.ones((active.size, env.agents), bool)
     obs = copies.reset(np.asarray(seeds).reshape(-1), active)
     for _ in range(env.max_steps):
         action, carry = act(arrays, obs, carry)
         action = np.asarray(action)
         nan = ~np.isfinite(action)
-        lost, action = lost | (active & nan.any(axis=1)), np.where(nan, np.float32(0.0), action)
+        lost = lost | (active & nan.reshape(active.size, -1).any(axis=1))
+        action = np.where(nan, np.float32(0.0), action)
         step = copies.step(action, active)
         for name, reward in step.rewards.items():
-            totals[name] += np.where(active, reward, 0.0)
+            totals[name] += np.where(_over(active, reward), reward, 0.0)
         steps += active
         if record:
-            rows.append((obs, action, step.rewards, step.obs, step.terminated, step.truncated))
+            ends = (step.terminated, step.truncated)
+            rows.append((obs, action, step.rewards, step.obs, *ends, acting))
             valid.append(active)
         active = active & ~(step.terminated | step.truncated)
-        obs = step.obs
+        obs, acting = step.obs, step.active
         if not active.any():
             break
-
-    def shaped(x):
-        return jnp.asarray(x.reshape(pop, episodes))
 
     def kept(*xs):
         x = np.stack(xs, axis=1)[np.stack(valid, axis=1) & ~lost[:, None]]
         return x.astype(np.float32) if x.dtype == np.float64 else x
 
-    returns = {
-        name: shaped(np.where(lost, np.nan, total).astype(np.float32))
-        for name, total in totals.items()
-    }
-    played = Evaluation(returns, shaped(steps))
+    for total in totals.values():
+        total[lost] = np.nan
+    lanes = (pop, episodes)
+    told = jax.tree.map(lambda x: jnp.asarray(x.reshape(*lanes, *x.shape[1:])), (totals, steps))
+    played = Evaluation(*told)
     if not record:
         return played, None
     return played, Experience(Transition(*jax.tree.map(kept, *rows)), None)

@@ -46,8 +46,7 @@ def stack(*members: PyTree) -> PyTree:
             raise ValueError(f"cannot stack members that differ in {xs}: make it a float or equal")
         return xs[0]
 
-    first, *rest = (jax.tree.structure(member) for member in members)
-    if any(structure != first for structure in rest):
+    if len({jax.tree.structure(member) for member in members}) > 1:
         raise ValueError(
             "cannot stack members of different structure: only arrays and floats may differ, "
             "every other field (sizes, names) must be equal"

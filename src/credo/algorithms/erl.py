@@ -23,7 +23,7 @@ Departures from the printed boxes:
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import equinox as eqx
 import jax
@@ -41,6 +41,7 @@ from ..learners.manager import UCB, AbstractManager, Ledger, even
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, ddpg
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.mlp import MLP, Critic
+from ..networks.team import Team
 from ..replay import Replay, extend
 from ..rollout import Environment, Experience, blank, collect
 from ..types import Evaluation, Metrics
@@ -106,21 +107,12 @@ class ERL(eqx.Module):
             require.at_least(name, getattr(self, name), least)
         for name in ("sync_period", "replay_capacity", "test_episodes", "test_every"):
             require.at_least(name, getattr(self, name), 1)
-        require.within("elite_fraction", self.elite_fraction, 0, 1)
         require.within("crossover_probability", self.crossover_probability, 0, 1)
         require.at_least("updates_per_frame", self.updates_per_frame, 0)
         for signal in (self.fitness, *(learner.signal for learner in self.learners)):
             require.signal(signal, self.env.signals)
-        if not 1 <= self.elites <= self.population_size - max(1, len(self.learners)):
-            raise ValueError(
-                f"elite_fraction is {self.elite_fraction} of {self.population_size} members: that "
-                f"must be at least 1, and leave {max(1, len(self.learners))} slots for offspring"
-            )
-        if self.manager is None and self.workers < len(self.learners):
-            raise ValueError(
-                f"{self.workers} workers for {len(self.learners)} learners: some would never play; "
-                "give at least as many"
-            )
+        turns = self.workers if self.manager is None else len(self.learners)
+        require.room(self.elite_fraction, self.population_size, len(self.learners), turns)
 
     @classmethod
     def erl(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
@@ -129,7 +121,8 @@ class ERL(eqx.Module):
         name = str(getattr(inner, "id", "")).partition("-v")[0]
         ψ, ξ, ω = TABLE_5_1.get(name, TABLE_5_1["HalfCheetah"])
         settings: dict[str, Any] = {"elite_fraction": ψ, "episodes": ξ, "sync_period": ω}
-        return cls(env, network or ERL_NETWORK, **settings | overrides)
+        network = network or (ERL_NETWORK if env.agents is None else Team())
+        return cls(env, network, **settings | overrides)
 
     @classmethod
     def ours(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
@@ -181,39 +174,10 @@ class ERL(eqx.Module):
         return int(self.elite_fraction * self.population_size)
 
     def init(self, *, key: PRNGKeyArray) -> ERLState:
-        if self.learners:
-            require.trainable(self.env)
-        population_key, *learner_keys = jax.random.split(key, 1 + len(self.learners))
-        sizes = (self.env.obs_size, self.env.action_size)
-        k, q = self.population_size, len(self.learners)
-        # 1-4: Initialize learners, a population of k actors, and an empty cyclic replay buffer.
-        learners = tuple(
-            learner.init(self.network, *sizes, key=learner_key)
-            for learner, learner_key in zip(self.learners, learner_keys, strict=True)
-        )
-        population = eqx.filter_vmap(lambda key: self.network.init(*sizes, key=key))(
-            jax.random.split(population_key, k)
-        )
-        return ERLState(
-            population,
-            Lineage.first(k, q),
-            learners,
-            Replay.empty(blank(self.env), self.replay_capacity) if learners else None,
-            Ledger.empty(q),
-            even(self.workers, max(q, 1)),
-            tree.take(population, 0),
-            jnp.float32(jnp.nan),
-            *(jnp.int32(0) for _ in range(3)),
-        )
+        return begin(self, key=key)
 
     def warm(self, state: ERLState, policy: AbstractPolicy) -> ERLState:
-        """`state` that goes on from a saved policy: the first member, and every learner."""
-        learners = tuple(
-            learner.warm(s, policy)
-            for learner, s in zip(self.learners, state.learners, strict=True)
-        )
-        population = tree.put(state.population, 0, policy)
-        return eqx.tree_at(lambda s: (s.population, s.learners), state, (population, learners))
+        return warm(self, state, policy)
 
     def generation(self, state: ERLState, *, key: PRNGKeyArray) -> tuple[ERLState, Metrics]:
         """One pass of the outer loop of Algorithms 6 and 10."""
@@ -222,9 +186,8 @@ class ERL(eqx.Module):
         )
         # 6-7: for actor in pop: fitness, R = Evaluate(actor, R, noise=None, ξ)
         played, experience = collect(self.env, state.population, self.episodes, key=evaluate_key)
-        fitness = jnp.mean(played.returns[self.signal], axis=1)
-        frames, episodes = jnp.sum(played.steps), jnp.int32(played.steps.size)
-        replay: Any = self.stored(state.replay, played, experience) if self.learners else None
+        fitness = jnp.mean(played.of(self.signal), axis=1)
+        replay = stored(self, state.replay, played, experience) if self.learners else None
 
         # 8-15: rank, keep the elites, select, cross and mutate.
         lineage, standing = state.lineage, fitness
@@ -234,14 +197,11 @@ class ERL(eqx.Module):
             self, state.population, lineage, standing, key=breed_key
         )
         # 16-20: learners play too, with noise; what they earn is their value.
-        replay, ledger, counts, explored = self.explore(state, replay, key=explore_key)
-        frames, episodes = frames + counts[0], episodes + counts[1]
+        replay, ledger, counts, explored = explore(self, state, replay, key=explore_key)
+        frames, episodes = jnp.sum(played.steps) + counts[0], played.steps.size + counts[1]
 
         # 21-29: as many updates as frames, each learner on minibatches of its own.
-        ready = (state.frames >= self.warmup_frames) & bool(self.learners)
-        updates = jnp.where(ready, frames.astype(jnp.float32) * self.updates_per_frame, 0.0)
-        updates = updates.astype(jnp.int32)
-        learners, learned = self.learn(state.learners, replay, updates, key=learn_key)
+        learners, learned = improve(self, state, replay, frames, key=learn_key)
 
         # 30-33: allocate the workers of the next generation.
         allocation = state.allocation
@@ -250,84 +210,14 @@ class ERL(eqx.Module):
 
         # 34-36: every ω generations, copy each learner's actor over the weakest.
         generation = state.generation + 1
-        sync = (generation % self.sync_period == 0) & (updates > 0)
+        sync = (generation % self.sync_period == 0) & (learned["updates"] > 0)
         actors = [learner.actor(s) for learner, s in zip(self.learners, learners, strict=True)]
         population, lineage = inject(population, lineage, actors, sync)
 
-        due = (generation - 1) % self.test_every == 0
-        score = when(
-            due,
-            lambda: rollout.score(self.env, fittest, self.test_episodes, key=test_key),
-            lambda: state.score,
-        )
-        metrics = {
-            "fitness_max": jnp.max(rankable(fitness)),
-            "fitness_mean": jnp.nanmean(fitness),
-            "fitness_nan": jnp.sum(jnp.isnan(fitness)),
-            "champion_score": score,
-            "episodes": state.episodes + episodes,
-            "updates": updates,
-            "frames": frames,
-        }
-        return ERLState(
-            population,
-            lineage,
-            learners,
-            replay,
-            ledger,
-            allocation,
-            fittest,
-            score,
-            state.frames + frames,
-            state.episodes + episodes,
-            generation,
-        ), metrics | bred | explored | learned
-
-    def explore(
-        self, state: ERLState, replay: Any, *, key: PRNGKeyArray
-    ) -> tuple[Any, Ledger, tuple[Int[Array, ""], Int[Array, ""]], Metrics]:
-        """Lines 16-20 of Algorithm 10: each learner's workers play an episode with noise.
-
-        **Returns:** the buffer, the ledger, frames and episodes played, and who played how much.
-        """
-        ledger, metrics = state.ledger, {}
-        frames = episodes = jnp.int32(0)
-        for i, learner in enumerate(self.learners):
-            workers = jnp.sum((state.allocation == i).astype(jnp.int32))
-            explorer = learner.explorer(state.learners[i], jnp.bool_(False))
-            played, experience = collect(
-                self.env,
-                tree.stack(explorer),
-                self.workers,
-                wanted=workers,
-                common=False,
-                key=jax.random.fold_in(key, i),
-            )
-            replay = self.stored(replay, played, experience)
-            returns, theirs = played.returns[self.signal][0], jnp.arange(self.workers) < workers
-            ledger = (self.manager or UCB()).observe(ledger, i, returns, theirs)
-            frames, episodes = frames + jnp.sum(played.steps), episodes + workers
-            metrics |= {f"workers_{i}": workers, f"value_{i}": ledger.value[i]}
-        return replay, ledger, (frames, episodes), metrics
-
-    def stored(self, replay: Replay, played: Evaluation, experience: Experience) -> Replay:
-        """The buffer with what was played."""
-        experience = experience.spread(played) if self.redistribute else experience
-        return extend(replay, experience.transitions, experience.valid)
-
-    def learn(
-        self, states: tuple[PyTree, ...], replay: Any, updates: Int[Array, ""], *, key: PRNGKeyArray
-    ) -> tuple[tuple[PyTree, ...], Metrics]:
-        """Lines 21-29 of Algorithm 10: `updates` steps of each learner on the common buffer."""
-        learned, metrics = [], {}
-        for i, learner in enumerate(self.learners):
-            step_key = jax.random.fold_in(key, i)
-            state, report = learn(
-                learner, states[i], replay, updates, signal=self.signal, key=step_key
-            )
-            learned.append(state)
-            metrics |= {f"{name}_{i}": value for name, value in report.items()}
-        return tuple(learned), metrics
+        after = (population, lineage, learners, replay, ledger, allocation, fittest, state.score)
+        counted = (state.frames + frames, state.episodes + episodes, generation)
+        metrics = {"frames": frames} | bred | explored | learned
+        return tested(self, ERLState(*after, *counted), fitness, metrics, key=test_key)
 
     @property
     def signal(self) -> str:
@@ -335,39 +225,163 @@ class ERL(eqx.Module):
         return self.fitness or self.env.signals[0]
 
 
+class Hybrid(Protocol):
+    """What the phases below need of an algorithm with a population and learners."""
+
+    env: Any
+    network: Any
+    learners: Any
+    population_size: Any
+    selection: Any
+    crossover: Any
+    crossover_probability: Any
+    mutation: Any
+    workers: Any
+    redistribute: Any
+    updates_per_frame: Any
+    warmup_frames: Any
+    replay_capacity: Any
+    test_episodes: Any
+    test_every: Any
+
+    @property
+    def manager(self) -> AbstractManager | None: ...
+    @property
+    def elites(self) -> int: ...
+    @property
+    def signal(self) -> str: ...
+
+
+def begin(hybrid: Hybrid, *, key: PRNGKeyArray) -> ERLState:
+    """1-4: Initialize learners, a population of k actors, and an empty cyclic replay buffer."""
+    env, network, k, q = hybrid.env, hybrid.network, hybrid.population_size, len(hybrid.learners)
+    require.fits(env, network, *hybrid.learners)
+    population_key, *learner_keys = jax.random.split(key, 1 + q)
+    learners = tuple(
+        learner.init(network, *env.sizes, key=learner_key)
+        for learner, learner_key in zip(hybrid.learners, learner_keys, strict=True)
+    )
+    population = eqx.filter_vmap(lambda key: network.init(*env.sizes, key=key))(
+        jax.random.split(population_key, k)
+    )
+    return ERLState(
+        population,
+        Lineage.first(k, q),
+        learners,
+        Replay.empty(blank(env), hybrid.replay_capacity) if learners else None,
+        Ledger.empty(q),
+        even(hybrid.workers, max(q, 1)),
+        tree.take(population, 0),
+        jnp.float32(jnp.nan),
+        *(jnp.int32(0) for _ in range(3)),
+    )
+
+
+def warm(hybrid: Hybrid, state: ERLState, policy: AbstractPolicy) -> ERLState:
+    """`state` that goes on from a saved policy: the first member, and every learner."""
+    learners = tuple(
+        learner.warm(s, policy) for learner, s in zip(hybrid.learners, state.learners, strict=True)
+    )
+    population = tree.put(state.population, 0, policy)
+    return eqx.tree_at(lambda s: (s.population, s.learners), state, (population, learners))
+
+
+def stored(hybrid: Hybrid, replay: Any, played: Evaluation, experience: Experience) -> Any:
+    """The buffer with what was played."""
+    experience = experience.spread(played) if hybrid.redistribute else experience
+    return extend(replay, experience.transitions, experience.valid)
+
+
+def explore(
+    hybrid: Hybrid, state: ERLState, replay: Any, *, key: PRNGKeyArray
+) -> tuple[Any, Ledger, tuple[Int[Array, ""], Int[Array, ""]], Metrics]:
+    """Lines 16-20 of Algorithm 10: each learner's workers play an episode with noise.
+
+    **Returns:** the buffer, the ledger, frames and episodes played, and who played how much.
+    """
+    ledger, metrics, workers = state.ledger, {}, hybrid.workers
+    frames = episodes = jnp.int32(0)
+    for i, learner in enumerate(hybrid.learners):
+        mine = jnp.sum((state.allocation == i).astype(jnp.int32))
+        team = tree.stack(learner.explorer(state.learners[i], jnp.bool_(False)))
+        explore_key = jax.random.fold_in(key, i)
+        played, experience = collect(
+            hybrid.env, team, workers, wanted=mine, common=False, key=explore_key
+        )
+        replay = stored(hybrid, replay, played, experience)
+        returns, theirs = played.of(hybrid.signal)[0], jnp.arange(workers) < mine
+        ledger = (hybrid.manager or UCB()).observe(ledger, i, returns, theirs)
+        frames, episodes = frames + jnp.sum(played.steps), episodes + mine
+        metrics |= {f"workers_{i}": mine, f"value_{i}": ledger.value[i]}
+    return replay, ledger, (frames, episodes), metrics
+
+
+def improve(
+    hybrid: Hybrid, state: ERLState, replay: Any, frames: Int[Array, ""], *, key: PRNGKeyArray
+) -> tuple[tuple[PyTree, ...], Metrics]:
+    """Lines 21-29 of Algorithm 10: each learner makes `updates_per_frame` steps for each of
+    `frames` on the common buffer."""
+    ready = (state.frames >= hybrid.warmup_frames) & bool(hybrid.learners)
+    updates = jnp.where(ready, frames.astype(jnp.float32) * hybrid.updates_per_frame, 0.0)
+    updates = updates.astype(jnp.int32)
+    learned, metrics = [], {"updates": updates}
+    for i, learner in enumerate(hybrid.learners):
+        step_key = jax.random.fold_in(key, i)
+        after, report = learn(
+            learner, state.learners[i], replay, updates, signal=hybrid.signal, key=step_key
+        )
+        learned.append(after)
+        metrics |= {f"{name}_{i}": value for name, value in report.items()}
+    return tuple(learned), metrics
+
+
+def tested(
+    hybrid: Hybrid, state: ERLState, fitness: Array, metrics: Metrics, *, key: PRNGKeyArray
+) -> tuple[ERLState, Metrics]:
+    """The champion on fresh episodes, every `test_every` generations; and what there is to say."""
+    score = when(
+        (state.generation - 1) % hybrid.test_every == 0,
+        lambda: rollout.score(hybrid.env, state.champion, hybrid.test_episodes, key=key),
+        lambda: state.score,
+    )
+    metrics = {
+        "fitness_max": jnp.max(rankable(fitness)),
+        "fitness_mean": jnp.nanmean(fitness),
+        "fitness_nan": jnp.sum(jnp.isnan(fitness)),
+        "champion_score": score,
+        "episodes": state.episodes,
+    } | metrics
+    return eqx.tree_at(lambda s: s.score, state, score), metrics
+
+
 @jit
 def breed(
-    erl: ERL,
-    population: PyTree,
-    lineage: Lineage,
-    fitness: Float[Array, " k"],
-    *,
-    key: PRNGKeyArray,
+    hybrid: Hybrid, population: PyTree, lineage: Lineage, fitness: Array, *, key: PRNGKeyArray
 ) -> tuple[PyTree, Lineage, AbstractPolicy, Metrics]:
     """The next population with its lineage, elites first; the champion; where it came from and
     what became of the learners' actors."""
     order_key, select_key, mate_key, chance_key, cross_key, mutate_key = jax.random.split(key, 6)
-    k, n = erl.population_size, erl.population_size - erl.elites
+    k, n = hybrid.population_size, hybrid.population_size - hybrid.elites
 
     # 8-9: Rank the population; select the first e as elites. Without selection all are equal.
     blind = jax.random.permutation(order_key, k)
-    order = ranking(fitness) if erl.selection.sees_fitness else blind
-    elites = order[: erl.elites]
+    order = ranking(fitness) if hybrid.selection.sees_fitness else blind
+    elites = order[: hybrid.elites]
     # 10: Select (k - e) actors, to form set S; the offspring of better parents come first.
-    parents = erl.selection(fitness, n, key=select_key)
+    parents = hybrid.selection(fitness, n, key=select_key)
     parents = parents[jnp.argsort(jnp.argsort(order)[parents], stable=True)]
     # 11-12: Crossover between a random elite and a member of S.
-    mates = elites[jax.random.randint(mate_key, (n,), 0, erl.elites)]
-    crossed = jax.random.bernoulli(chance_key, erl.crossover_probability, (n,))
+    mates = elites[jax.random.randint(mate_key, (n,), 0, hybrid.elites)]
+    crossed = jax.random.bernoulli(chance_key, hybrid.crossover_probability, (n,))
     crossed = crossed | repeated(parents)
     survivors = tree.take(population, parents)
-    children = eqx.filter_vmap(lambda a, b, key: erl.crossover(a, b, key=key))(
+    children = eqx.filter_vmap(lambda a, b, key: hybrid.crossover(a, b, key=key))(
         tree.take(population, mates), survivors, jax.random.split(cross_key, n)
     )
     offspring = eqx.filter_vmap(tree.where)(crossed, children, survivors)
     # 13-15: Mutate set S.
     taken = eqx.filter_vmap(share_of)(offspring, tree.take(population, mates), survivors)
-    mutants = eqx.filter_vmap(lambda genome, key: erl.mutation(genome, key=key))(
+    mutants = eqx.filter_vmap(lambda genome, key: hybrid.mutation(genome, key=key))(
         offspring, jax.random.split(mutate_key, n)
     )
     mutated = eqx.filter_vmap(differ)(mutants, offspring)
@@ -375,7 +389,7 @@ def breed(
     champion = ranking(fitness)[0]
     metrics = {"champion_maker": lineage.maker[champion]}
     fates = lineage.fates(elites, parents)
-    for i in range(len(erl.learners)):
+    for i in range(len(hybrid.learners)):
         metrics[f"champion_share_{i}"] = lineage.share[champion, 1 + i]
         metrics |= {f"{fate}_{i}": count[i] for fate, count in fates.items()}
     return (

@@ -142,9 +142,9 @@ class Neuroevolution(eqx.Module):
         return int(self.elite_fraction * self.population_size)
 
     def new_population(self, *, key: PRNGKeyArray) -> PyTree:
-        return eqx.filter_vmap(
-            lambda key: self.network.init(self.env.obs_size, self.env.action_size, key=key)
-        )(jax.random.split(key, self.population_size))
+        return eqx.filter_vmap(lambda key: self.network.init(*self.env.sizes, key=key))(
+            jax.random.split(key, self.population_size)
+        )
 
     def init(self, *, key: PRNGKeyArray) -> NeuroevolutionState:
         # 1: Initialize a population of k neural networks.
@@ -175,7 +175,7 @@ class Neuroevolution(eqx.Module):
         # The network with the highest fitness is tested on fresh episodes of the whole task.
         champion = tree.take(population, order[:1])
         test = evaluate(self.env, champion, self.test_episodes, key=test_key)
-        score = self.score or self.env.signals[-1]
+        score = self.score or self.env.reported
         metrics = {
             "fitness_max": jnp.max(rankable(fitness)),
             "fitness_mean": jnp.nanmean(returns),
@@ -196,10 +196,10 @@ def assess(
 ) -> tuple[Float[Array, " pop"], Float[Array, " pop"]]:
     """Fitness, with earlier generations of an elite mixed in; and that of this one alone."""
     signals = algorithm.fitness or algorithm.env.signals[:1]
-    total = jnp.stack([evaluation.returns[name] for name in signals]).sum(axis=0)
+    total = jnp.stack([evaluation.of(name) for name in signals]).sum(axis=0)
     returns = jnp.mean(total, axis=1)
     if algorithm.parsimony:
-        score = evaluation.returns[algorithm.score or algorithm.env.signals[-1]]
+        score = evaluation.returns[algorithm.score or algorithm.env.reported]
         returns = returns + algorithm.parsimony(state.population) * jnp.mean(score, axis=1)
     age = state.age.astype(jnp.float32)
     mixed = (state.record * age + returns) / (age + 1.0)

@@ -17,8 +17,9 @@ from .. import require, rollout, tree
 from ..compilation import when
 from ..learners.base import AbstractLearner, learn
 from ..learners.sac import SAC
-from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, ddpg
+from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, ddpg, maddpg, matd3
 from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.team import Team
 from ..replay import Replay, extend
 from ..rollout import Environment, blank, collect
 from ..types import Metrics
@@ -59,7 +60,7 @@ class OffPolicy(eqx.Module):
     @classmethod
     def td3(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of TD3's authors, second version."""
-        return cls(env, network or TD3_NETWORK, **overrides)
+        return cls(env, network or (TD3_NETWORK if env.agents is None else Team()), **overrides)
 
     @classmethod
     def ddpg(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
@@ -74,14 +75,27 @@ class OffPolicy(eqx.Module):
         return cls(env, network or TD3_NETWORK, **settings | overrides)
 
     @classmethod
+    def matd3(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """A team, in ten worlds at a time, with the team's constants of MERL."""
+        settings = {"learner": matd3(), "episodes": 10, "start_frames": 5_000}
+        settings |= {"updates_per_frame": 0.1, "replay_capacity": 100_000}
+        return cls(env, network or Team(), **settings | overrides)
+
+    @classmethod
+    def maddpg(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """As `matd3`."""
+        return cls.matd3(env, network, **{"learner": maddpg()} | overrides)
+
+    @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
         """Settings by name, for the command line."""
-        return {"td3": cls.td3, "ddpg": cls.ddpg, "sac": cls.sac}
+        names = ("td3", "ddpg", "sac", "matd3", "maddpg")
+        return {name: getattr(cls, name) for name in names}
 
     def init(self, *, key: PRNGKeyArray) -> OffPolicyState:
         env = self.env
-        require.trainable(env)
-        learner = self.learner.init(self.network, env.obs_size, env.action_size, key=key)
+        require.fits(env, self.network, self.learner)
+        learner = self.learner.init(self.network, *env.sizes, key=key)
         replay = Replay.empty(blank(env), self.replay_capacity)
         actor = self.learner.actor(learner)
         return OffPolicyState(learner, replay, actor, jnp.float32(jnp.nan), jnp.int32(0))
@@ -125,7 +139,7 @@ class OffPolicy(eqx.Module):
             lambda: rollout.score(self.env, actor, self.test_episodes, key=test_key),
             lambda: state.score,
         )
-        returns = played.returns[self.learner.signal or signal]
+        returns = played.of(self.learner.signal or signal)
         metrics |= {
             "fitness_max": jnp.max(returns),
             "fitness_mean": jnp.mean(returns),

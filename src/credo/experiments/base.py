@@ -40,6 +40,8 @@ MODULES = {
     "fig-6.5": "fig_6_5",
     "table-6.1": "table_6_1",
     "beyond-6": "beyond_6",
+    "fig-7.1": "fig_7_1",
+    "fig-7.4": "fig_7_4",
 }
 BUDGETS = ("smoke", "quick", "full")  # a module may define more, as a name of the same
 

@@ -232,7 +232,7 @@ def outcome(name: str, runs: list[Run], axis: str = "frames") -> dict[str, Any]:
         ],
         "last": attribution.plain([score[-1] for score in scores], 2),
         "last smoothed": attribution.plain([score[-1] for score in smooth], 2),
-        "final": attribution.plain(played.returns[env.signals[-1]], 2),
+        "final": attribution.plain(played.of(env.reported), 2),
         "played": [int(m["frames"][-1]) for m in metrics],
         "updates per frame": attribution.plain(updates, 3),
         "floor": attribution.plain(floor, 2),
@@ -266,7 +266,7 @@ def random_returns(env: Any, episodes: int = RANDOM_EPISODES) -> tuple[float, fl
         actor = MLP(hidden=()).init(env.obs_size, env.action_size, key=jax.random.key(0))
         policy = Explorer(actor, GaussianNoise(), jnp.bool_(True), env.action_size)
         played = evaluate(env, tree.stack(policy), episodes, key=jax.random.key(21_000))
-        returns = np.asarray(played.returns[env.signals[-1]][0], np.float64)
+        returns = np.asarray(played.of(env.reported)[0], np.float64)
         mean, error = statistics.mean_and_standard_error(returns)
         _FLOORS[env] = float(mean), float(error)
     return _FLOORS[env]

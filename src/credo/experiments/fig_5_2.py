@@ -65,6 +65,7 @@ def cells(budget: str) -> list[Cell]:
             stop_at=STOP,
             first_seed=FRESH if label == "erl ours" else 0,
             test_episodes=TEST,
+            **({"test_every": 10} if kind == "ea" else {}),
         )
         for delayed in (False, True)
         for label, build in ALGORITHMS.items()
@@ -113,7 +114,8 @@ def sections(measured: dict[str, Any]) -> list[Any]:
             measured,
             "Episodes count those of the whole population and of its learner. A run ends when the "
             f"mean return of its champion's test reaches {STOP:,.0f} ({TEST} episodes), or "
-            "at its limit. DDPG is tested every 5,000 frames only, EA and ERL every generation. "
+            "at its limit. DDPG is tested every 5,000 frames only, EA every tenth generation, ERL "
+            "every generation. "
             "Learners of `ours` and `spread` see the return of an episode in equal parts over its "
             "frames; the task still pays it at the end, and fitness is what the task paid.",
         ),

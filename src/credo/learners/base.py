@@ -2,7 +2,7 @@
 share."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -26,13 +26,17 @@ class AbstractLearner(eqx.Module):
     signal: eqx.AbstractVar[str | None]  # the reward it optimises; None: the task's first
     batch_size: eqx.AbstractVar[int]  # transitions per update
     metrics: eqx.AbstractClassVar[tuple[str, ...]]  # names of what `update` reports
+    teams: ClassVar[bool] = False  # whether it learns for all agents of a team
 
     @abc.abstractmethod
-    def init(
-        self, network: AbstractNetwork, obs_size: int, action_size: int, *, key: PRNGKeyArray
-    ) -> PyTree:
-        """Fresh networks and optimiser states. The actor is one of `network`'s policies, so that
-        it can join a population of them."""
+    def init(self, network: AbstractNetwork, *sizes: int, key: PRNGKeyArray) -> PyTree:
+        """Fresh networks and optimiser states for a task of these `sizes` (`env.sizes`). The actor
+        is one of `network`'s policies, so that it can join a population of them."""
+
+    @property
+    def together(self) -> bool:
+        """Whether the agents of a team learn from the same frames; else each draws its own."""
+        return False
 
     @abc.abstractmethod
     def update(self, state: PyTree, batch: Batch, *, key: PRNGKeyArray) -> tuple[PyTree, Metrics]:
@@ -82,9 +86,9 @@ def _learn(
     def body(i, loop):
         dynamic, total = loop
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
-        rows = replay.sample(learner.batch_size, key=sample_key)
+        rows = replay.sample(learner.batch_size, together=learner.together, key=sample_key)
         reward = rows.rewards[learner.signal or signal]
-        ends = (rows.terminated, rows.truncated)
+        ends = (rows.terminated, rows.truncated, rows.active)
         batch = Batch(rows.obs, rows.action, reward, rows.next_obs, *ends)
         state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)
         return eqx.filter(state, eqx.is_array), jax.tree.map(jnp.add, total, metrics)
@@ -124,7 +128,19 @@ def polyak(target: PyTree, source: PyTree, tau: Float[Array, ""] | float) -> PyT
     )
 
 
-def act(policy: AbstractPolicy, obs: Float[Array, "batch obs"]) -> Float[Array, "batch act"]:
+def features_first(x: Float[Array, "batch *agents size"]) -> Float[Array, "size batch *agents"]:
+    """Observations or actions as critics take them."""
+    return jnp.moveaxis(x, -1, 0)
+
+
+def mean(x: Float[Array, "*batch"], active: Bool[Array, "*batch"] | None) -> Float[Array, ""]:
+    """The mean over those who acted."""
+    return jnp.mean(x) if active is None else jnp.mean(x, where=active)
+
+
+def act(
+    policy: AbstractPolicy, obs: Float[Array, "batch *agents obs"]
+) -> Float[Array, "batch *agents act"]:
     """Actions of a memoryless policy, for a batch."""
     if policy.features_first:  # one matrix product per layer
         return policy(obs.T, policy.start(key=None))[0].T  # pyright: ignore[reportArgumentType]

@@ -103,11 +103,10 @@ class SAC(AbstractLearner):
         for name in ("critics", "batch_size"):
             require.at_least(name, getattr(self, name), 1)
 
-    def init(
-        self, network: AbstractNetwork, obs_size: int, action_size: int, *, key: PRNGKeyArray
-    ) -> SACState:
+    def init(self, network: AbstractNetwork, *sizes: int, key: PRNGKeyArray) -> SACState:
         if not (isinstance(network, MLP) and network.output_activation == "tanh"):
             raise TypeError(f"SAC needs an MLP with a tanh output as its network, not {network}")
+        obs_size, action_size = sizes
         actor_key, head_key, critic_key = jax.random.split(key, 3)
         mean = network.init(obs_size, action_size, key=actor_key)
         units = network.hidden[-1] if network.hidden else obs_size

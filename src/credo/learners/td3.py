@@ -6,7 +6,7 @@ authors' first code. Time limits bootstrap; the author of ERL took them for the 
 The author clipped the gradient of DDPG's critic twice and of its actor never; both are clipped.
 """
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -18,11 +18,30 @@ from .. import require
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import AbstractNoise, Explorer, GaussianNoise, OrnsteinUhlenbeck
 from ..networks.mlp import MLP, AbstractCritic, AbstractCriticNetwork, Critic, MLPPolicy
+from ..networks.team import JointCritic
 from ..types import Batch, Metrics
-from .base import AbstractLearner, act, adam, adam_state, polyak, require_memoryless
+from .base import (
+    AbstractLearner,
+    act,
+    adam,
+    adam_state,
+    features_first,
+    mean,
+    polyak,
+    require_memoryless,
+)
 
 TD3_NETWORK = MLP(hidden=(256, 256), activation="relu", initializer="uniform")
 """The actor of TD3's authors, second version."""
+TEAM: dict[str, Any] = {
+    "gamma": 0.97,
+    "actor_lr": 1e-3,
+    "critic_lr": 1e-3,
+    "noise": GaussianNoise(0.4),
+    "batch_size": 128,
+}
+"""What every learner of a team has in common; γ and noise of the author, whose rates (5e-5, 1e-5)
+hardly move a network."""
 ERL_NETWORK = MLP(hidden=(128, 128), normalization="before", initializer="uniform")
 """The actor of ERL (Khadka 2019, section 5.4)."""
 
@@ -35,12 +54,14 @@ class TD3State(eqx.Module):
     actor_opt: optax.OptState
     critic_opt: optax.OptState
     step: Int[Array, ""]
+    agents: tuple[int, ...] = eqx.field(static=True)  # of a team how many
 
 
 class TD3(AbstractLearner):
     """Deterministic actor-critic: twin critics, delayed policy, target policy smoothing."""
 
     metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "q")
+    teams: ClassVar[bool] = True
 
     critic: AbstractCritic = Critic()
     gamma: float = 0.99  # discount per step, in [0, 1]
@@ -71,20 +92,22 @@ class TD3(AbstractLearner):
         for name in ("critics", "policy_delay", "batch_size"):
             require.at_least(name, getattr(self, name), 1)
 
-    def init(
-        self, network: AbstractNetwork, obs_size: int, action_size: int, *, key: PRNGKeyArray
-    ) -> TD3State:
+    @property
+    def together(self) -> bool:
+        return self.critic.joint
+
+    def init(self, network: AbstractNetwork, *sizes: int, key: PRNGKeyArray) -> TD3State:
         actor_key, critic_key = jax.random.split(key)
-        actor = network.init(obs_size, action_size, key=actor_key)
+        actor = network.init(*sizes, key=actor_key)
         require_memoryless(network, actor)
         if isinstance(actor, MLPPolicy):
             actor = actor.scaled(self.actor_scale)
         critics = tuple(
-            self.critic.init(obs_size, action_size, key=key)
+            self.critic.init(*(sizes if self.together else sizes[:2]), key=key)
             for key in jax.random.split(critic_key, self.critics)
         )
         opts = (adam_state(actor), adam_state(critics))
-        return TD3State(actor, critics, actor, critics, *opts, jnp.int32(0))
+        return TD3State(actor, critics, actor, critics, *opts, jnp.int32(0), sizes[2:])
 
     def update(
         self, state: TD3State, batch: Batch, *, key: PRNGKeyArray
@@ -111,19 +134,19 @@ class TD3(AbstractLearner):
         else:
             moving = move_policy()
         actor, actor_opt, target_actor, target_critics = moving
-        state = TD3State(
-            actor, critics, target_actor, target_critics, actor_opt, critic_opt, state.step + 1
-        )
+        targets, opts = (target_actor, target_critics), (actor_opt, critic_opt)
+        state = TD3State(actor, critics, *targets, *opts, state.step + 1, state.agents)
         return state, {"critic_loss": critic_loss, "q": q}
 
     def bellman_target(
         self, state: TD3State, batch: Batch, *, key: PRNGKeyArray
-    ) -> Float[Array, " batch"]:
+    ) -> Float[Array, "batch *agents"]:
         """y = r + γ min_i Q'_i(s', π'(s') + clipped noise)."""
         noise = self.target_noise * jax.random.normal(key, batch.action.shape)
         noise = jnp.clip(noise, -self.target_noise_clip, self.target_noise_clip)
         action = jnp.clip(act(state.target_actor, batch.next_obs) + noise, -1.0, 1.0)
-        qs = [critic(batch.next_obs.T, action.T) for critic in state.target_critics]
+        pair = (features_first(batch.next_obs), features_first(action))
+        qs = [critic(*pair) for critic in state.target_critics]
         q = jnp.min(jnp.stack(qs), axis=0)
         ended = batch.terminated
         if not self.bootstrap_truncated:
@@ -135,7 +158,8 @@ class TD3(AbstractLearner):
         return state.actor
 
     def explorer(self, state: TD3State, random: Bool[Array, ""]) -> AbstractPolicy:
-        return Explorer(state.actor, self.noise, random, state.critics[0].action_size)
+        shape = (*state.agents, state.critics[0].action_size)
+        return Explorer(state.actor, self.noise, random, shape)
 
     def warm(self, state: TD3State, actor: AbstractPolicy) -> TD3State:
         return eqx.tree_at(lambda s: (s.actor, s.target_actor), state, (actor, actor))
@@ -166,16 +190,31 @@ def ddpg(**fields) -> TD3:
     return TD3(**(settings | fields))
 
 
+def matd3(**fields: Any) -> TD3:
+    """MATD3 as settings of `TD3`: each agent's twin critics see the whole team."""
+    settings = TEAM | {"critic": JointCritic()} | fields
+    return TD3(**settings)
+
+
+def maddpg(**fields: Any) -> TD3:
+    """MADDPG (Lowe et al. 2017, Algorithm 1) as settings of `TD3`, with this file's constants."""
+    return matd3(**({"critics": 1, "policy_delay": 1, "target_noise": 0.0} | fields))
+
+
 def critic_error(
-    critics: tuple[AbstractCriticNetwork, ...], batch: Batch, target: Float[Array, " batch"]
+    critics: tuple[AbstractCriticNetwork, ...], batch: Batch, target: Float[Array, "batch *agents"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Sum over critics of the mean squared Bellman error, and their mean value."""
-    qs = jnp.stack([critic(batch.obs.T, batch.action.T) for critic in critics])
-    return jnp.sum(jnp.mean(jnp.square(qs - target[None]), axis=1)), jnp.mean(qs)
+    pair = (features_first(batch.obs), features_first(batch.action))
+    qs = [critic(*pair) for critic in critics]
+    errors = [mean(jnp.square(q - target), batch.active) for q in qs]
+    return jnp.sum(jnp.stack(errors)), jnp.mean(jnp.stack(qs))
 
 
 def actor_loss(
     actor: AbstractPolicy, critic: AbstractCriticNetwork, batch: Batch
 ) -> Float[Array, ""]:
     """Minus the value of what the actor would do (deterministic policy gradient)."""
-    return -jnp.mean(critic(batch.obs.T, act(actor, batch.obs).T))
+    actions = (act(actor, batch.obs), batch.action)
+    q = critic.own(features_first(batch.obs), *map(features_first, actions))
+    return -mean(q, batch.active)

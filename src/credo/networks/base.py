@@ -57,6 +57,9 @@ class AbstractPolicy(eqx.Module):
 class AbstractNetwork(eqx.Module):
     """The config of a policy."""
 
+    team: ClassVar[bool] = False
+    """Whether its policies act for all agents; `init` then takes their number behind the sizes."""
+
     @abc.abstractmethod
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> AbstractPolicy:
         """A policy with fresh weights."""
@@ -65,7 +68,7 @@ class AbstractNetwork(eqx.Module):
 def matvec(w: Float[Array, "out in *batch"], x: Float[Array, "in *batch"]) -> Array:
     """`W x`, features first."""
     if w.ndim == 2:
-        return w @ x
+        return jnp.tensordot(w, x, 1)
     # Written out term by term XLA makes one loop over the contiguous batch; as a sum over an
     # axis it makes a strided reduction, five to ten times slower.
     product = w[:, 0] * x[0][None]

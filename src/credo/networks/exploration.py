@@ -58,14 +58,14 @@ class Explorer(AbstractPolicy):
     policy: AbstractPolicy
     noise: AbstractNoise
     random: Bool[Array, ""]  # draw actions uniformly from [-1, 1]
-    action_size: int = eqx.field(static=True)
+    shape: int | tuple[int, ...] = eqx.field(static=True)  # of an action; of a team (agents, act)
     clipped: bool = eqx.field(static=True, default=True)
     """Clip actions to [-1, 1] here; else the rollout does, and the transition has what was said."""
     features_first: ClassVar[bool] = False
 
     def start(self, *, key: PRNGKeyArray) -> PyTree:
         policy_key, noise_key = jax.random.split(key)
-        return self.policy.start(key=policy_key), jnp.zeros(self.action_size), noise_key
+        return self.policy.start(key=policy_key), jnp.zeros(self.shape), noise_key
 
     def __call__(self, obs, carry):
         carry, before, key = carry

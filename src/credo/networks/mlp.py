@@ -81,7 +81,13 @@ class MLPPolicy(AbstractPolicy):
 
 
 class AbstractCritic(eqx.Module):
-    """Config of an action-value network Q(s, a)."""
+    """Config of an action-value network Q(s, a).
+
+    Of a team it values each agent's own observation and action, unless it is `joint`.
+    """
+
+    joint: ClassVar[bool] = False
+    """Whether it sees the whole team; `init` then takes the number of agents behind the sizes."""
 
     @abc.abstractmethod
     def init(
@@ -100,6 +106,11 @@ class AbstractCriticNetwork(eqx.Module):
         self, obs: Float[Array, "obs *batch"], action: Float[Array, "act *batch"]
     ) -> Float[Array, "*batch"]:
         """Q(s, a)."""
+
+    def own(self, obs: Array, action: Array, done: Array) -> Float[Array, "*batch"]:
+        """Q(s, a) where each agent does `action` while the rest of its team does what was `done`;
+        of one agent Q(s, a). Shapes as above."""
+        return self(obs, action)
 
 
 class Critic(AbstractCritic):

@@ -1,0 +1,139 @@
+"""Teams: Khadka (2019), section 7.3 and Figure 7.2. One policy acts for all agents.
+
+Each agent answers to its own observation with its own head; heads stand on a trunk that they share.
+Everything or nothing may be shared instead. And critics that see a whole team.
+"""
+
+from typing import ClassVar, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from .. import require, tree
+from .base import ACTIVATIONS, INITIALIZERS, AbstractNetwork, AbstractPolicy
+from .mlp import (
+    MLP,
+    AbstractCritic,
+    AbstractCriticNetwork,
+    Critic,
+    CriticNetwork,
+    draw_layers,
+    hidden_layers,
+)
+
+
+class Team(AbstractNetwork):
+    """Config of a multi-headed policy.
+
+    `init` takes the number of agents behind the sizes of one agent's observation and action.
+    """
+
+    team: ClassVar[bool] = True
+
+    trunk: tuple[int, ...] = eqx.field(static=True, default=(100, 100))  # units of its layers
+    head: AbstractNetwork = MLP(hidden=(), initializer="uniform")
+    """What stands on the trunk; with memory, such as MMU, it can be evolved only."""
+    sharing: Literal["trunk", "everything", "nothing"] = eqx.field(static=True, default="trunk")
+    activation: str = eqx.field(static=True, default="tanh")  # of the trunk
+    initializer: str = eqx.field(static=True, default="uniform")  # of the trunk, as in MLP
+
+    def __check_init__(self):
+        for i, units in enumerate(self.trunk):
+            require.at_least(f"trunk[{i}]", units, 1)
+        require.choice("sharing", self.sharing, ("trunk", "everything", "nothing"))
+        require.choice("activation", self.activation, ACTIVATIONS)
+        require.choice("initializer", self.initializer, (*INITIALIZERS, "uniform"))
+
+    def init(
+        self, obs_size: int, action_size: int, agents: int = 1, *, key: PRNGKeyArray
+    ) -> "TeamPolicy":
+        trunk_key, head_key = jax.random.split(key)
+        sizes = (obs_size, *self.trunk)
+        trunks = 1 if self.sharing != "nothing" else agents
+        heads = 1 if self.sharing == "everything" else agents
+        return TeamPolicy(
+            tuple(
+                draw_layers(sizes, self.initializer, key=key)
+                for key in jax.random.split(trunk_key, trunks)
+            ),
+            tuple(
+                self.head.init(sizes[-1], action_size, key=key)
+                for key in jax.random.split(head_key, heads)
+            ),
+            self,
+            agents,
+        )
+
+
+class TeamPolicy(AbstractPolicy):
+    """Weights of trunk and heads: one of each for all, or one per agent. A leaf is a matrix of one
+    of them, so that operators on genomes see what is published."""
+
+    trunks: tuple[dict[str, Float[Array, "..."]], ...]
+    heads: tuple[AbstractPolicy, ...]
+    config: Team = eqx.field(static=True)
+    agents: int = eqx.field(static=True)
+
+    def start(self, *, key: PRNGKeyArray) -> PyTree:
+        keys = jax.random.split(key, self.agents)
+        return self._each(lambda _, head, key: head.start(key=key), keys)
+
+    def __call__(
+        self, obs: Float[Array, "agents obs"], carry: PyTree
+    ) -> tuple[Float[Array, "agents act"], PyTree]:
+        def one(trunk, head, obs, carry):
+            c = self.config
+            return head(hidden_layers(trunk, obs, len(c.trunk), c.activation, "none"), carry)
+
+        return self._each(one, obs, carry)
+
+    def _each(self, function, *rest: PyTree) -> PyTree:
+        """`function(trunk, head, *rest)` for every agent. What is shared has no axis of agents, so
+        that a layer is one matrix product for all."""
+        parts = [
+            (one_of[0], None) if len(one_of) == 1 else (tree.stack(*one_of), eqx.if_array(0))
+            for one_of in (self.trunks, self.heads)
+        ]
+        axes = (*(axis for _, axis in parts), *(0 for _ in rest))
+        return eqx.filter_vmap(function, in_axes=axes, axis_size=self.agents)(
+            *(part for part, _ in parts), *rest
+        )
+
+
+class JointCritic(AbstractCritic):
+    """A critic for each agent that sees what all of them observe and do: Lowe et al. (2017),
+    "Multi-Agent Actor-Critic for Mixed Cooperative-Competitive Environments", equation 6."""
+
+    joint: ClassVar[bool] = True
+
+    critic: Critic = Critic(hidden=(128, 128))  # of each agent
+
+    def init(self, obs_size, action_size, agents=1, *, key):
+        networks = eqx.filter_vmap(
+            lambda key: self.critic.init(agents * obs_size, agents * action_size, key=key)
+        )(jax.random.split(key, agents))
+        return JointCriticNetwork(networks, action_size)
+
+
+class JointCriticNetwork(AbstractCriticNetwork):
+    """One network per agent: leaves `[agents, ...]`. Here `*batch` is `n agents`."""
+
+    networks: CriticNetwork
+    action_size: int = eqx.field(static=True)
+
+    def __call__(self, obs, action):
+        return eqx.filter_vmap(lambda q: q(_join(obs), _join(action)))(self.networks).T
+
+    def own(self, obs, action, done):
+        def value(network, agent):
+            mine = jnp.arange(action.shape[2]) == agent
+            return network(_join(obs), _join(jnp.where(mine, action, done)))
+
+        return eqx.filter_vmap(value)(self.networks, jnp.arange(action.shape[2])).T
+
+
+def _join(x: Float[Array, "size n agents"]) -> Float[Array, "size*agents n"]:
+    """What all agents of a team have, as one vector."""
+    return jnp.moveaxis(x, 2, 0).reshape(-1, x.shape[1])
