@@ -121,6 +121,9 @@ EXPERIMENTS = {
     "beyond-6": "SAC and a critic of 2024 beside TD3, and three managers",
     "fig-7.1": "two rovers and a local reward that misleads",
     "fig-7.4": "rover domain, coupling 1 to 7",
+    "fig-7.5": "paths of teams at coupling 3",
+    "beyond-7": "difference rewards, levels of credit, memory, sharing",
+    "check-spread": "MADDPG and MATD3 on simple_spread",
 }
 PRESETS = {
     "as-written": "Algorithm 2 as printed (the default)",

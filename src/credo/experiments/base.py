@@ -42,6 +42,9 @@ MODULES = {
     "beyond-6": "beyond_6",
     "fig-7.1": "fig_7_1",
     "fig-7.4": "fig_7_4",
+    "fig-7.5": "fig_7_5",
+    "beyond-7": "beyond_7",
+    "check-spread": "check_spread",
 }
 BUDGETS = ("smoke", "quick", "full")  # a module may define more, as a name of the same
 

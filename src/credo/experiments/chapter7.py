@@ -64,7 +64,8 @@ def build(method: str, env: Rover, updates_per_frame: float) -> Any:
 def task(method: str, **fields: Any) -> Rover:
     """The rover domain with the reward signals that a method needs."""
     mixed = ("mixed",) if method.endswith("mixed") else ()
-    return Rover(**({"rewards": ("global", "local", *mixed)} | fields))
+    settings: dict[str, Any] = {"rewards": ("global", "local", *mixed)} | fields
+    return Rover(**settings)
 
 
 def cell(method: str, env: Rover, where: str, budget: str, planned: Plan, first_seed=0) -> Cell:
@@ -87,7 +88,7 @@ def shrunk(algorithm: Any) -> Any:
     return dataclasses.replace(algorithm, test_episodes=2, **fields)
 
 
-def _small(learner: TD3) -> TD3:
+def _small(learner: Any) -> TD3:
     critic = Critic(hidden=(8,))
     critic = JointCritic(critic) if learner.critic.joint else critic
     return dataclasses.replace(learner, critic=critic, batch_size=16)

@@ -192,7 +192,7 @@ def ddpg(**fields) -> TD3:
 
 def matd3(**fields: Any) -> TD3:
     """MATD3 as settings of `TD3`: each agent's twin critics see the whole team."""
-    settings = TEAM | {"critic": JointCritic()} | fields
+    settings: dict[str, Any] = TEAM | {"critic": JointCritic()} | fields
     return TD3(**settings)
 
 

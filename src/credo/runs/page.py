@@ -103,6 +103,16 @@ class HeatMap:
 
 
 @dataclass(frozen=True)
+class Drawing:
+    """A picture of its own: one `<svg>` element for each colouring, whose ids differ."""
+
+    title: str
+    light: str
+    dark: str
+    caption: str = ""
+
+
+@dataclass(frozen=True)
 class Table:
     """Rows of cells: numbers are rounded to four digits and right-aligned, strings are shown as
     given, None and NaN are a dash."""
@@ -127,7 +137,7 @@ class Text:
     paragraphs: Sequence[str]
 
 
-Section = Figure | HeatMap | Table | Text
+Section = Figure | HeatMap | Drawing | Table | Text
 
 
 @dataclass(frozen=True)
@@ -186,8 +196,8 @@ def groups(sections: Sequence[Section]) -> list[tuple[int, list[Section]]]:
     """Neighbouring figures together, everything else alone, each with the index of its first."""
     found: list[tuple[int, list[Section]]] = []
     for index, section in enumerate(sections):
-        drawn = isinstance(section, Figure | HeatMap)
-        if drawn and found and isinstance(found[-1][1][0], Figure | HeatMap):
+        drawn = isinstance(section, Figure | HeatMap | Drawing)
+        if drawn and found and isinstance(found[-1][1][0], Figure | HeatMap | Drawing):
             found[-1][1].append(section)
         else:
             found.append((index, [section]))
@@ -203,7 +213,7 @@ def render_group(first: int, group: Sequence[Section]) -> str:
     figures = "\n".join(
         render_figure(figure, f"s{first + offset}")
         for offset, figure in enumerate(group)
-        if isinstance(figure, Figure | HeatMap)
+        if isinstance(figure, Figure | HeatMap | Drawing)
     )
     kind = "figures alone" if len(group) == 1 else "figures"
     return f'<div class="{kind}">\n{figures}\n</div>'
@@ -214,13 +224,17 @@ def render_text(text: Text) -> str:
     return f'<section class="text">{heading(text.title)}{paragraphs}</section>'
 
 
-def render_figure(figure: Figure | HeatMap, name: str) -> str:
+def render_figure(figure: Figure | HeatMap | Drawing, name: str) -> str:
     """Both colourings of a figure; the style sheet shows one. `name` keeps their ids apart."""
     from . import plots
 
-    light = plots.figure_svg(figure, dark=False, prefix=f"{name}-light-")
-    dark = plots.figure_svg(figure, dark=True, prefix=f"{name}-dark-")
-    caption = render_caption(figure.caption, plots.note(figure))
+    if isinstance(figure, Drawing):
+        light, dark, note = figure.light, figure.dark, ""
+    else:
+        light = plots.figure_svg(figure, dark=False, prefix=f"{name}-light-")
+        dark = plots.figure_svg(figure, dark=True, prefix=f"{name}-dark-")
+        note = plots.note(figure)
+    caption = render_caption(figure.caption, note)
     return (
         f'<figure>{heading(figure.title)}<div class="plot">'
         f'<div class="light">{light}</div><div class="dark">{dark}</div></div>'
