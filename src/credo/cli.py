@@ -136,7 +136,7 @@ COMMANDS = {
     "train": "train an algorithm on a task: credo train neuroevolution sequence-classification",
     "resume": "go on with a run, also to a larger budget",
     "evaluate": "play fresh episodes with a run's champion",
-    "watch": "film a champion on a task of Gymnasium: credo watch RUN film.mp4",
+    "watch": "show a champion: credo watch RUN [page.html|film.gif|film.mp4]",
     "export": "a champion in one file that acts without JAX: credo export RUN policy.safetensors",
     "reproduce": "rerun a figure or table of the dissertation: credo reproduce fig-3.4a",
     "report": "one HTML page about one or more runs",
@@ -387,24 +387,24 @@ def _evaluate(argv: list[str]) -> None:
 
 @dataclasses.dataclass
 class WatchOptions:
-    """Film episodes of a champion on a task of Gymnasium."""
+    """Show a champion: rovers in a page that plays, tasks of Gymnasium in a film."""
 
     episodes: int = 1  # one after the other
     seed: int = 0  # of the first episode; the next ones count up
-    fps: float | None = None  # steps shown per second; None: in real time
+    fps: float | None = None  # steps shown per second; None: in real time, of rovers 5
     size: tuple[int, int] = (480, 480)  # width and height in pixels, where a task lets us choose
 
 
 def _watch(argv: list[str]) -> None:
-    path, argv = _positional(argv, "watch RUN [FILM]", "the run's folder; film.gif or film.mp4")
+    path, argv = _positional(argv, "watch RUN [FILE]", "the run's folder; .html, .gif or .mp4")
     film, argv = (argv[0], argv[1:]) if argv and not argv[0].startswith("-") else ("", argv)
-    (options,) = parse("credo watch RUN [FILM]", None, WatchOptions, argv)
+    (options,) = parse("credo watch RUN [FILE]", None, WatchOptions, argv)
 
     def go() -> None:
         from .runs import loop, watch
 
-        target = film or pathlib.Path(path) / "champion.gif"
-        print(f"film: {watch.watch(loop.Run(path), pathlib.Path(target), **vars(options))}")
+        target = pathlib.Path(film) if film else None
+        print(f"wrote {watch.watch(loop.Run(path), target, **vars(options))}")
 
     _guarded(go)
 

@@ -148,10 +148,19 @@ def test_without_ffmpeg_the_extra_is_named(tmp_path, monkeypatch):
         watch(run, tmp_path / "film.mp4")
 
 
-def test_our_own_tasks_have_nothing_to_draw(tmp_path):
+def test_without_a_name_the_film_lies_in_the_run(tmp_path):
+    run = made(tmp_path / "run", task())
+    assert watch(run) == run.path / "champion.gif"
+    assert len(frames(run.path / "champion.gif")[0]) == LENGTH + 1
+
+
+@pytest.mark.parametrize("output", [None, "film.gif"])
+def test_a_task_of_numbers_has_nothing_to_draw(tmp_path, output):
     run = made(tmp_path / "run", SequenceRecall(depth=2))
-    with pytest.raises(RunError, match=r"nothing to draw.*`credo report .*run` shows"):
-        watch(run, tmp_path / "film.gif")
+    told = r"nothing to draw.*rovers and tasks of Gymnasium\. `credo report .*run` shows"
+    with pytest.raises(RunError, match=told):
+        watch(run, output and tmp_path / output)
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
 @pytest.mark.parametrize(
@@ -174,6 +183,7 @@ def test_what_cannot_be_drawn_says_why_and_leaves_no_file(tmp_path, env, told):
     ("wrong", "told"),
     [
         ({"output": "film.avi"}, r"'film\.avi': its name must end in \.mp4 or \.gif"),
+        ({"output": "film.html"}, r"'film\.html': its name must end in \.mp4 or \.gif"),
         ({"episodes": 0}, "episodes is 0"),
         ({"fps": 0}, "fps is 0"),
         ({"size": (0, 10)}, "width is 0"),

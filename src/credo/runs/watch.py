@@ -1,4 +1,4 @@
-"""What `credo watch` makes: a film of a champion."""
+"""What `credo watch` makes: a film of a champion, or a page that plays in the browser."""
 
 import contextlib
 import importlib.util
@@ -20,60 +20,110 @@ from .. import require
 from ..environments import worker
 from ..environments.gymnasium import Gymnasium
 from ..environments.host import AbstractHostEnvironment
-from ..environments.wrappers import DelayedHostReward
+from ..environments.rover import Rover
+from ..environments.wrappers import DelayedHostReward, DelayedReward
+from . import replay_page
 from .loop import Policy, Run, RunError
 
 FASTEST = 50  # pictures per second: browsers slow a gif down that has more
 STEPS = 30  # per second, where an environment does not say
+ROVER_STEPS = 5  # per second; in real time it would be one
 
 
 def watch(
     run: Run,
-    output: str | pathlib.Path,
+    output: str | pathlib.Path | None = None,
     *,
     episodes: int = 1,
     seed: int = 0,
     fps: float | None = None,
     size: tuple[int, int] = (480, 480),
 ) -> pathlib.Path:
-    """Film episodes of a run's champion on its Gymnasium task, without a window.
+    """Show episodes of a run's champion, without a window: on a Gymnasium task or with rovers as a
+    film, with rovers also as a page that plays in the browser.
 
-    The environment is made in this process.
+    A Gymnasium environment is made in this process.
 
     **Arguments:**
 
-    - `output`: a file that ends in .gif, or in .mp4, which needs the extra `credo[video]`.
-    - `episodes`: one after the other, with environment seeds `seed`, `seed` + 1, …
+    - `output`: a file that ends in .gif, in .mp4, which needs the extra `credo[video]`, or with
+      rovers in .html; None: `champion.html` in the run's folder with rovers, else `champion.gif`.
+    - `episodes`: one after the other, with seeds `seed`, `seed` + 1, …
     - `fps`: environment steps shown per second; None: in real time, as far as the environment
-      tells. Above 50 some steps are left out.
-    - `size`: width and height in pixels, where the environment lets us choose (MuJoCo's do).
+      tells, and 5 with rovers. Above 50 a film leaves some steps out. The speed of a page can be
+      changed in the page.
+    - `size`: width and height of a film in pixels, where the environment lets us choose (MuJoCo's
+      and rovers do).
 
-    **Returns:** `output`. What was there is replaced once the film is whole.
+    **Returns:** `output`. What was there is replaced once the new file is whole.
 
     **Raises:** `RunError` if the task or this machine cannot draw; `ValueError`.
     """
-    output = pathlib.Path(output)
     require.at_least("episodes", episodes, 1)
     require.at_least("width", size[0], 2)
     require.at_least("height", size[1], 2)
     if fps is not None and not 0 < fps < math.inf:
         raise ValueError(f"fps is {fps}: it must be more than 0")
+    env = run.algorithm.env
+    rovers, task = rover_task(env), gymnasium_task(env)
+    default = run.path / ("champion.html" if rovers is not None else "champion.gif")
+    output = default if output is None else pathlib.Path(output)
+    seeds = range(seed, seed + episodes)
+    if rovers is not None:
+        return _watch_rovers(run, rovers, output, seeds, fps or ROVER_STEPS, size)
     write = _writer(output)
-    task = gymnasium_task(run.algorithm.env)
     if task is None:
         raise RunError(_nothing_to_see(run))
-    draft = output.with_name(f".{output.stem}.draft{output.suffix}")
     with opened(task, **_drawing(task, size)) as copy:
         rate = fps or copy._envs[0].metadata.get("render_fps") or STEPS
         stride = math.ceil(rate / FASTEST)
-        output.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            seeds = range(seed, seed + episodes)
-            write(draft, _pictures(copy, task.id, run.policy(), seeds, stride), rate / stride)
-            draft.replace(output)
-        finally:
-            draft.unlink(missing_ok=True)
+        pictures = _pictures(copy, task.id, run.policy(), seeds, stride)
+        return _film(write, output, pictures, rate / stride)
+
+
+def _watch_rovers(
+    run: Run,
+    env: Rover,
+    output: pathlib.Path,
+    seeds: range,
+    rate: float,
+    size: tuple[int, int],
+) -> pathlib.Path:
+    page = output.suffix.lower() == ".html"
+    write = None if page else _writer(output, "in .html, .mp4 or .gif")
+    episodes = replay_page.play(env, run.champion, seeds)
+    if write is None:
+        title = f"Credo: {run.path.name}"
+        lead = (
+            f"The champion with {env.agents} rovers, {env.pois} POIs and coupling {env.coupling}."
+        )
+        return replay_page.write(env, episodes, output, title=title, lead=lead, speed=rate)
+    from . import trajectories  # matplotlib, for a film alone
+
+    stride = math.ceil(rate / FASTEST)
+    pictures = trajectories.pictures(env, episodes, size, stride)
+    return _film(write, output, pictures, rate / stride)
+
+
+def _film(
+    write: "Writer", output: pathlib.Path, pictures: Iterator[np.ndarray], rate: float
+) -> pathlib.Path:
+    """Pictures in a file that is there once it is whole."""
+    draft = output.with_name(f".{output.stem}.draft{output.suffix}")
+    output.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        write(draft, pictures, rate)
+        draft.replace(output)
+    finally:
+        draft.unlink(missing_ok=True)
     return output
+
+
+def rover_task(env: Any) -> Rover | None:
+    """The rover domain itself, without what pays its rewards later; None if it is another task."""
+    while isinstance(env, DelayedReward):
+        env = env.env
+    return env if isinstance(env, Rover) else None
 
 
 def gymnasium_task(env: Any) -> Gymnasium | None:
@@ -104,10 +154,11 @@ def opened(task: Gymnasium, **kwargs: Any) -> Iterator[worker.Environments]:
 
 def _nothing_to_see(run: Run) -> str:
     env = run.algorithm.env
+    name, seen = type(env).__name__, "what can be watched are rovers and tasks of Gymnasium"
     if isinstance(env, AbstractHostEnvironment):
-        return f"{type(env).__name__} cannot be drawn: only tasks of Gymnasium can"
+        return f"{name} cannot be drawn: {seen}"
     return (
-        f"{type(env).__name__} has nothing to draw: its observations are plain numbers. "
+        f"{name} has nothing to draw: its observations are plain numbers; {seen}. "
         f"`credo report {run.path}` shows what the run has learned"
     )
 
@@ -183,13 +234,16 @@ def _advice(env: gymnasium.Env) -> str:
     return "install what it names, or mend its render()"
 
 
-def _writer(output: pathlib.Path) -> Callable[[pathlib.Path, Iterator[np.ndarray], float], None]:
+Writer = Callable[[pathlib.Path, Iterator[np.ndarray], float], None]
+
+
+def _writer(output: pathlib.Path, kinds: str = "in .mp4 or .gif") -> Writer:
     """What writes pictures to such a file."""
     kind = output.suffix.lower()
     if kind == ".gif":
         return _write_gif
     if kind != ".mp4":
-        raise ValueError(f"the film is to be {str(output)!r}: its name must end in .mp4 or .gif")
+        raise ValueError(f"the output is to be {str(output)!r}: its name must end {kinds}")
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise RunError(
             f"cannot write {output}: imageio-ffmpeg is not installed; "

@@ -1,0 +1,358 @@
+"""Replays of rovers: a page, a film and a figure show exactly what the champion did."""
+
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+from PIL import Image
+
+from credo import tree
+from credo.algorithms.merl import MERL
+from credo.environments.rover import Rover
+from credo.environments.simple_spread import SimpleSpread
+from credo.environments.wrappers import DelayedReward
+from credo.networks.base import AbstractPolicy
+from credo.networks.recurrent import Recurrent
+from credo.networks.team import Team
+from credo.rollout import evaluate
+from credo.runs import checkpoint, config, replay_page, trajectories
+from credo.runs.loop import Run, RunError
+from credo.runs.watch import watch
+
+ENV = Rover(coupling=2, rovers=3, pois=2, size=8.0, max_steps=9)
+NETWORK = Team(trunk=(4,), head=Recurrent("gru", 3))
+SHOWN = ("position", "heading", "poi", "observed", "inside", "share", "sensors")
+
+
+class Seeker(AbstractPolicy):
+    """Turns to where the outer ring is strongest and drives there."""
+
+    speed: jax.Array
+
+    def start(self, *, key):
+        return None
+
+    def __call__(self, obs, carry):
+        bracket = jnp.argmax(obs[:, 36:], axis=1).astype(jnp.float32)
+        turn = (bracket + 0.5) / 18.0
+        turn = jnp.where(turn > 1.0, turn - 2.0, turn)
+        return jnp.stack([turn, jnp.full_like(turn, self.speed)], axis=1), carry
+
+
+SEEKER = Seeker(jnp.float32(1.0))
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return replay_page.play(ENV, SEEKER, [3, 4, 5])
+
+
+def made(path, env=ENV) -> Run:
+    """A run on disk whose champion has fresh weights."""
+    path.mkdir()
+    algorithm = MERL(env, NETWORK, learners=(), population_size=10)
+    policy = NETWORK.init(*env.sizes, key=jax.random.key(7))
+    checkpoint.export_policy(path / "champion.safetensors", policy)
+    config.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
+    return Run(path)
+
+
+def embedded(html):
+    """The data in a page."""
+    (text,) = re.findall(r'<script type="application/json">(.*?)</script>', html, re.S)
+    return json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} in the page"))
+
+
+def test_what_is_recorded_is_what_evaluation_plays():
+    for policy in (SEEKER, NETWORK.init(*ENV.sizes, key=jax.random.key(0))):
+        for seed in range(3, 6):
+            states, seen = replay_page.record(ENV, policy, key=jax.random.key(seed))
+            played = evaluate(ENV, tree.stack(policy), 1, key=jax.random.key(seed))
+            steps = int(played.steps[0, 0])
+            assert len(states.position) == len(seen.obs) == steps + 1
+            assert states.step.tolist() == list(range(steps + 1))
+            assert (seen.terminated | seen.truncated).tolist() == [False] * steps + [True]
+            for name, reward in seen.rewards.items():
+                assert not reward[0].any()
+                np.testing.assert_allclose(
+                    reward.sum(axis=0), played.returns[name][0, 0], rtol=1e-5
+                )
+
+
+def test_an_episode_agrees_with_itself(episodes):
+    assert len({len(episode.position) for episode in episodes}) > 1  # some end early
+    assert sum(episode.observed[-1].sum() for episode in episodes) >= 3
+    for episode in episodes:
+        frames = len(episode.position)
+        assert episode.sensors.shape == (frames, 3, 2, 36)
+        # A POI is observed at the end of the first step with two rovers inside, and stays so.
+        enough = episode.inside >= 2
+        enough[0] = False
+        np.testing.assert_array_equal(episode.observed, np.logical_or.accumulate(enough, axis=0))
+        np.testing.assert_allclose(episode.share, episode.observed.mean(axis=1))
+        assert episode.rewards["global"][-1] == episode.share[-1]
+        # The strongest bar of the outer ring is the closest unobserved POI, as local says.
+        for t in range(frames):
+            if not episode.observed[t].all():
+                closest = 1 / episode.sensors[t, :, 1].max(axis=1) - 1
+                way = episode.poi[~episode.observed[t]] - episode.position[t][:, None]
+                np.testing.assert_allclose(
+                    closest, np.linalg.norm(way, axis=2).min(axis=1), rtol=1e-3, atol=1e-4
+                )
+
+
+def test_the_share_of_a_graded_reward_counts_who_was_near():
+    graded = {"graded": True, "rewards": ("global",), "poi_values": (1.0, 3.0)}
+    env = dataclasses.replace(ENV, activation_distance=0.2, **graded)
+    for episode in replay_page.play(env, SEEKER, [0, 1]):
+        assert list(episode.rewards) == ["global"]
+        np.testing.assert_allclose(episode.share[-1], episode.rewards["global"][-1], rtol=1e-6)
+        assert 0 < episode.share[1] < 1
+        html = replay_page.player(env, [episode])
+        assert list(embedded(html)["episodes"][0]["rewards"]) == ["global"]
+
+
+def test_the_page_holds_the_episodes_bit_for_bit(tmp_path, episodes):
+    path = replay_page.write(ENV, episodes, tmp_path / "new" / "a.html", title="A <b>", speed=5)
+    assert [p.name for p in path.parent.iterdir()] == ["a.html"]
+    html = path.read_text()
+    assert "<h1>A &lt;b&gt;</h1>" in html
+    data = embedded(html)
+    assert (data["size"], data["activation_distance"], data["coupling"]) == (8, 3, 2)
+    assert [e["name"] for e in data["episodes"]] == ["seed 3", "seed 4", "seed 5"]
+    for shown, episode in zip(data["episodes"], episodes, strict=True):
+        for name in SHOWN:
+            told, meant = np.array(shown[name]), getattr(episode, name)
+            np.testing.assert_array_equal(told.astype(meant.dtype), meant)
+        assert shown["rewards"].keys() == episode.rewards.keys() == {"global", "local"}
+        for name, reward in episode.rewards.items():
+            told = np.array(shown["rewards"][name], np.float32)
+            np.testing.assert_array_equal(told, reward)
+
+
+def test_sensors_as_coded_are_cut_out_of_their_own_layout():
+    env = dataclasses.replace(ENV, observation="as-coded")
+    policy = NETWORK.init(*env.sizes, key=jax.random.key(0))
+    (episode,) = replay_page.play(env, policy, [0])
+    _, seen = replay_page.record(env, policy, key=jax.random.key(0))
+    np.testing.assert_array_equal(episode.sensors[:, :, 0], seen.obs[:, :, 1:37])
+    np.testing.assert_array_equal(episode.sensors[:, :, 1], seen.obs[:, :, 37:73])
+    assert embedded(replay_page.player(env, [episode]))["observation"] == "as-coded"
+
+
+class Reader(HTMLParser):
+    """Elements with their attributes, and the text of each option."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.elements, self.options = [], {}
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        tag, attrs = self.elements[-1] if self.elements else ("", {})
+        if tag == "option" and data.strip():
+            select = [a["class"] for t, a in self.elements if t == "select"][-1]
+            self.options.setdefault(select, []).append((attrs, data))
+
+
+def test_the_page_has_its_controls_and_asks_nobody(tmp_path, episodes):
+    html = replay_page.write(ENV, episodes, tmp_path / "a.html", title="A", speed=7.5).read_text()
+    read = Reader(html)
+    kinds = {attrs.get("class"): (tag, attrs) for tag, attrs in read.elements}
+    for name, tag in (("play", "button"), ("time", "input"), ("field", "svg"), ("sensors", "svg")):
+        assert kinds[name][0] == tag
+    assert kinds["play"][1]["aria-label"] == "Play"
+    assert (kinds["time"][1]["type"], kinds["time"][1]["aria-label"]) == ("range", "Time step")
+    assert [label for _, label in read.options["episode"]] == ["seed 3", "seed 4", "seed 5"]
+    assert [label for _, label in read.options["rover"]] == ["0", "1", "2"]
+    speeds = {label: attrs for attrs, label in read.options["speed"]}
+    assert [label for label, attrs in speeds.items() if "selected" in attrs] == ["7.5 steps/s"]
+    assert speeds["20 steps/s"]["value"] == "20"
+    # No address but the name of SVG, which nobody looks up.
+    assert set(re.findall(r"\w+://[^\"' ]+", html)) == {"http://www.w3.org/2000/svg"}
+    assert not [
+        attrs for tag, attrs in read.elements if tag in ("script", "img") and "src" in attrs
+    ]
+    assert html.count("prefers-color-scheme: dark") >= 2
+
+
+DRIVE = """<script>addEventListener('load', () => {
+  const say = () => document.title += '|' + document.querySelector('.step').textContent + ', ' +
+    document.querySelector('.who').textContent + ', ' +
+    document.querySelectorAll('.dot.seen').length + ' seen, ' +
+    document.querySelectorAll('.arc.lit').length + ' lit, ' +
+    document.querySelectorAll('.sensors path.others, .sensors path.pois').length + ' bars';
+  const press = key => document.body.dispatchEvent(
+    new KeyboardEvent('keydown', {key, bubbles: true}));
+  document.title = '';
+  say();
+  press('ArrowRight'); press('ArrowRight'); press('ArrowLeft'); press('ArrowDown'); say();
+  document.querySelectorAll('g.rover')[2].dispatchEvent(new MouseEvent('click', {bubbles: true}));
+  press('End'); say();
+});</script>"""
+
+
+def test_a_browser_shows_it(tmp_path, episodes):
+    names = ("chromium", "chromium-browser", "google-chrome", "chrome")
+    browser = next(filter(None, map(shutil.which, names)), None)
+    if browser is None:
+        pytest.skip("no Chromium on this machine")
+    episode = episodes[0]
+    path = replay_page.write(ENV, episodes[:1], tmp_path / "a.html", title="A")
+    path.write_text(path.read_text().replace("</body>", DRIVE + "</body>"))
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=1000"]
+    command = [browser, *options, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom"]
+    page = subprocess.run([*command, path.as_uri()], capture_output=True, text=True, timeout=60)
+    title = re.findall("<title>(.*?)</title>", page.stdout)[0]  # rovers have titles too
+    last = len(episode.position) - 1
+    expected = []
+    for t, rover in ((0, 0), (1, 1), (last, 2)):
+        seen, lit = episode.observed[t].sum(), np.minimum(episode.inside[t], 2).sum()
+        bars = (episode.sensors[t, rover] > 0).sum()
+        expected.append(
+            f"step {t} of {last}, What rover {rover} senses, {seen} seen, {lit} lit, {bars} bars"
+        )
+    assert title.split("|")[1:] == expected
+
+
+def test_a_name_cannot_end_the_script(episodes):
+    evil = dataclasses.replace(episodes[0], name="</script><script>alert(1)")
+    html = replay_page.player(ENV, [evil])
+    assert "</script><script>alert" not in html
+    assert embedded(html)["episodes"][0]["name"] == evil.name
+
+
+def test_what_cannot_be_replayed_is_told(episodes):
+    with pytest.raises(ValueError, match="no episode to play"):
+        replay_page.player(ENV, [])
+    broken = dataclasses.replace(episodes[0], share=np.float32([0.0, np.nan]))
+    with pytest.raises(ValueError, match="not finite: it cannot be replayed"):
+        replay_page.player(ENV, [broken])
+
+
+def test_watch_writes_a_page_of_the_champion_by_default(tmp_path):
+    run = made(tmp_path / "run", DelayedReward(ENV))
+    output = watch(run, episodes=2, seed=30, fps=4)
+    assert output == run.path / "champion.html"
+    data = embedded(output.read_text())
+    expected = replay_page.play(ENV, run.champion, [30, 31])
+    assert len(data["episodes"]) == 2
+    for shown, episode in zip(data["episodes"], expected, strict=True):
+        assert shown["name"] == episode.name
+        np.testing.assert_array_equal(np.float32(shown["position"]), episode.position)
+    assert ">4 steps/s</option>" in output.read_text()
+    assert sorted(p.name for p in run.path.iterdir()) == [
+        "champion.html",
+        "champion.safetensors",
+        "config.json",
+    ]
+
+
+def test_watch_films_rovers(tmp_path):
+    run = made(tmp_path / "run")
+    output = watch(run, tmp_path / "film.gif", episodes=2, seed=1, fps=100, size=(200, 180))
+    lengths = [len(e.position) - 1 for e in replay_page.play(ENV, run.champion, [1, 2])]
+    with Image.open(output) as film:
+        assert film.size == (200, 180)
+        assert film.info["duration"] == 20
+        # Every other step, and the last one.
+        assert film.n_frames == sum(len({*range(0, last, 2), last}) for last in lengths)
+        film.seek(0)
+        first = np.asarray(film.convert("RGB")).astype(int)
+        film.seek(1)
+        assert np.abs(np.asarray(film.convert("RGB")) - first).max() > 50  # it moved
+
+
+def test_an_mp4_of_rovers_has_every_step(tmp_path, episodes):
+    pytest.importorskip("imageio_ffmpeg")
+    import imageio_ffmpeg
+
+    run = made(tmp_path / "run")
+    output = watch(run, tmp_path / "film.mp4", seed=1, size=(160, 160))
+    (episode,) = replay_page.play(ENV, run.champion, [1])
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(output))
+    assert frames == len(episode.position)
+    assert seconds == pytest.approx(frames / 5, abs=0.21)
+
+
+@pytest.mark.parametrize(
+    ("env", "output", "error", "told"),
+    [
+        (ENV, "a.webm", ValueError, r"a\.webm': its name must end in \.html, \.mp4 or \.gif"),
+        (SimpleSpread(), None, RunError, "SimpleSpread has nothing to draw.* are rovers and tasks"),
+    ],
+    ids=["suffix", "task"],
+)
+def test_what_cannot_be_watched_names_what_can(tmp_path, env, output, error, told):
+    run = made(tmp_path / "run", env)
+    with pytest.raises(error, match=told):
+        watch(run, output and tmp_path / output)
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_film_shows_the_rovers_where_they_are(episodes):
+    """The colour of the first rover is found at its place, and no POI is red before its time."""
+    episode = episodes[0]
+    frames = list(trajectories.pictures(ENV, [episode], (300, 300)))
+    assert len(frames) == len(episode.position)
+    assert {frame.shape for frame in frames} == {(300, 300, 3)}
+    red = matplotlib.colors.to_rgb(trajectories.SEEN[trajectories.LIGHT])
+    red = np.round(255 * np.array(red))
+    seen = [bool((np.abs(frame - red).max(axis=2) < 3).any()) for frame in frames]
+    assert seen == episode.observed.any(axis=1).tolist()
+
+
+def drawn(episode, **changes):
+    arguments = {"activation_distance": 3.0, "size": 8.0, "title": "MERL"} | changes
+    return trajectories.trajectories(
+        episode.position, episode.poi, episode.observed[-1], **arguments
+    )
+
+
+def test_a_figure_of_trajectories(episodes, tmp_path):
+    episode = dataclasses.replace(episodes[0], observed=np.array([[True, False]]))
+    svg = drawn(episode, prefix="left-")
+    assert svg.startswith("<svg")
+    assert 'aria-label="MERL: paths of 3 rovers; 1 of 2 POIs observed"' in svg
+    assert svg.count("#c8102e") >= 2  # the ring and the POI
+    for color in trajectories.LIGHT.curves[:3]:
+        assert color in svg
+    assert trajectories.LIGHT.curves[3] not in svg
+    assert set(re.findall(r'\bid="(.{5})', svg)) == {"left-"}
+    unseen = dataclasses.replace(episode, observed=np.array([[False, False]]))
+    assert "#c8102e" not in drawn(unseen)
+    assert trajectories.SEEN[trajectories.DARK] in drawn(episode, dark=True)
+    path = trajectories.save_png(
+        *(tmp_path / "a.png", episode.position, episode.poi, episode.observed[-1]),
+        activation_distance=3.0,
+        size=8.0,
+        title="MERL",
+        dpi=100,
+    )
+    with Image.open(path) as image:
+        assert image.size == (420, 450)
+
+
+@pytest.mark.parametrize(
+    ("position", "poi", "observed", "told"),
+    [
+        (np.zeros((4, 2)), np.zeros((1, 2)), [True], r"position has shape \(4, 2\): give"),
+        (np.zeros((4, 1, 2)), np.zeros((1, 2)), [True, True], r"\(1, 2\) and observed \(2,\)"),
+        (np.full((4, 1, 2), np.nan), np.zeros((1, 2)), [True], "is not finite"),
+    ],
+    ids=["position", "observed", "nan"],
+)
+def test_wrong_trajectories_are_told(position, poi, observed, told):
+    with pytest.raises(ValueError, match=told):
+        trajectories.trajectories(position, poi, observed, activation_distance=1.0, size=5.0)
