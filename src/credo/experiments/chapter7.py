@@ -68,8 +68,19 @@ def task(method: str, **fields: Any) -> Rover:
     return Rover(**settings)
 
 
-def cell(method: str, env: Rover, where: str, budget: str, planned: Plan, first_seed=0) -> Cell:
+def cell(
+    method: str,
+    env: Rover,
+    where: str,
+    budget: str,
+    planned: Plan,
+    first_seed: int = 0,
+    **settings: Any,
+) -> Cell:
+    """Runs of a method; `settings`: fields of those that have a population."""
     algorithm = build(method, env, planned.updates_per_frame)
+    if isinstance(algorithm, MERL):
+        algorithm = dataclasses.replace(algorithm, **settings)
     if budget == "smoke":
         algorithm = shrunk(algorithm)
     name = f"{method}, {where}"
