@@ -342,7 +342,10 @@ def test_pettingzoos_test_of_the_clock(name):
 
 
 def test_pettingzoos_test_of_drawing():
-    render_test(lambda render_mode: parallel_to_aec(to_pettingzoo(Drawn(), None, render_mode)))
+    for env in (Drawn(), rover(max_steps=4)):
+        render_test(
+            lambda render_mode, env=env: parallel_to_aec(to_pettingzoo(env, None, render_mode))
+        )
     env = to_pettingzoo(Drawn(), render_mode="rgb_array")
     env.reset(seed=0)
     assert env.metadata["render_modes"] == ["rgb_array"]

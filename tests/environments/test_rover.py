@@ -5,6 +5,7 @@ import functools
 import math
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -494,3 +495,17 @@ def test_fields():
 def test_impossible_fields_are_refused(fields, told):
     with pytest.raises(ValueError, match=re.escape(told)):
         Rover(**fields)
+
+
+def test_its_picture_shows_pois_and_rovers_where_they_are():
+    env = Rover(rovers=2, pois=1, coupling=2, size=20.0)
+    position, poi = jnp.array([[10.0, 10.0], [3.0, 16.0]]), jnp.array([[15.0, 5.0]])
+    state, _ = env.begin(position, jnp.zeros(2), poi)
+    picture = env.render(state, pixels=200)
+    assert (picture.shape, picture.dtype) == ((200, 200, 3), np.uint8)
+    assert picture[100, 100].tolist() == picture[40, 30].tolist() == [0, 92, 175]
+    assert picture[150, 150].tolist() == [0, 0, 0]  # row 0 is the north edge
+    assert picture[150, 180].tolist() == [0, 0, 0]  # the ring, 3 m to the east
+    assert picture[10, 190].tolist() == [255, 255, 255]
+    seen = eqx.tree_at(lambda s: s.observed, state, jnp.array([True]))
+    assert env.render(seen, pixels=200)[150, 150].tolist() == [200, 16, 46]

@@ -26,7 +26,8 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from .. import require
 from ..types import TimeStep
@@ -251,6 +252,25 @@ class Rover(AbstractEnvironment):
         rewards = self._pay(state, distance, terminated | truncated)
         obs = self._observe(state, apart, distance)
         return state, TimeStep(obs, rewards, terminated, truncated, jnp.ones(self.agents, bool))
+
+    def render(self, state: RoverState, pixels: int = 256) -> UInt8[np.ndarray, "h w 3"]:
+        """A picture of the field, north up: rings of the activation distance around POIs, red once
+        observed and black before, rovers as blue dots."""
+        metre = pixels / float(self.size)
+        x, y = np.meshgrid(np.arange(pixels) + 0.5, pixels - np.arange(pixels) - 0.5)
+        picture = np.full((pixels, pixels, 3), 255, np.uint8)
+
+        def away(place):
+            return np.hypot(x / metre - place[0], y / metre - place[1])
+
+        for place, seen in zip(np.asarray(state.poi), np.asarray(state.observed), strict=True):
+            color = (200, 16, 46) if seen else (0, 0, 0)
+            d = away(place)
+            picture[np.abs(d - float(self.activation_distance)) < 1 / metre] = color
+            picture[d < 0.35] = color
+        for place in np.asarray(state.position):
+            picture[away(place) < 0.3] = (0, 92, 175)
+        return picture
 
     def _places(self, key: PRNGKeyArray):
         """Start positions of rovers and POIs."""

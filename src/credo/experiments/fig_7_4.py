@@ -16,7 +16,7 @@ BUDGETS = chapter7.BUDGETS
 PLANS = {
     "smoke": Plan(1_500, 2),
     "quick": Plan(150_000, 2),
-    "full": Plan(1_000_000, 3),
+    "full": Plan(500_000, 3),
     "published": Plan(2_000_000, 5, 0.1),
 }
 COUPLINGS = {"smoke": (2,), "quick": (1, 2, 4, 7)}
