@@ -7,7 +7,15 @@ import importlib
 import os
 import sys
 
-NAMES = ("sequence_generation", "td3_update", "erl_hopper", "first_output", "replay_memory")
+NAMES = (
+    "sequence_generation",
+    "td3_update",
+    "erl_hopper",
+    "rover_step",
+    "maddpg_update",
+    "first_output",
+    "replay_memory",
+)
 
 if __name__ == "__main__":
     # One core for everybody: libraries that use two would be compared with those that use one.

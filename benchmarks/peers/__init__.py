@@ -4,12 +4,14 @@ import json
 import os
 import pathlib
 import subprocess
+from typing import Any
 
+PEERS = ("torch", "sbx", "evorl", "vmas", "benchmarl")
 FOLDER = pathlib.Path(__file__).parent
-VARIABLES = {"torch": "CREDO_PEER_TORCH", "sbx": "CREDO_PEER_SBX", "evorl": "CREDO_PEER_EVORL"}
+VARIABLES = {name: f"CREDO_PEER_{name.upper()}" for name in PEERS}
 
 
-def ask(peer: str, script: str, *arguments: str) -> dict[str, float] | None:
+def ask(peer: str, script: str, *arguments: str) -> dict[str, Any] | None:
     """What a peer's script measured; None if its Python is not given."""
     python = os.environ.get(VARIABLES[peer])
     if not python:
