@@ -26,8 +26,8 @@ class Experience(eqx.Module):
     valid: Bool[Array, " rows"] | None  # None: every row, which then come from the host
 
     def spread(self, played: Evaluation) -> "Experience":
-        """With every episode's return paid in equal parts over its frames, whenever the task paid
-        it: uniform redistribution (Gangwani et al. 2020; Ren et al. 2022, section 3)."""
+        """With every return of an episode, of whatever signal, paid in equal parts over its frames:
+        uniform redistribution (Gangwani et al. 2020; Ren et al. 2022, section 3)."""
         steps = played.steps.reshape(-1)
         length = jnp.maximum(steps, 1).astype(jnp.float32)[:, None]
         frames = max(self.transitions.terminated.shape[0] // steps.size, 1)

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +17,7 @@ def size(population: PyTree) -> int:
     return jax.tree.leaves(eqx.filter(population, eqx.is_array))[0].shape[0]
 
 
-def take(population: PyTree, index: Int[Array, "..."] | int) -> PyTree:
+def take(population: PyTree, index: Any) -> PyTree:
     """The members at `index`, in that order; a scalar index gives one member."""
     return jax.tree.map(lambda x: x[index] if eqx.is_array(x) else x, population)
 

@@ -239,13 +239,33 @@ def test_local_and_global_by_hand():
     assert bool(now.truncated)
     assert not bool(now.terminated)
     assert float(now.rewards["global"]) == 0.5
-    local = [-math.hypot(0.5, 9), -math.hypot(1, 8)]  # to the one that is left
+    local = [-2.5, -math.hypot(1, 2)]  # observed or not
     np.testing.assert_allclose(now.rewards["local"], local, rtol=1e-6)
     np.testing.assert_allclose(now.rewards["mixed"], np.add(local, 5.0), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("local", "before", "after"), [("distance", -4, 0), ("closeness", 0.75, 1)]
+    ("local", "there", "observing", "then"),
+    [
+        ("distance", -4.0, -3.0, -4.0),
+        ("unobserved", -4.0, -3.0, -6.0),
+        ("closeness", 0.75, 1.0, 0.5),
+        ("progress", 1.0, 1.0, -1.0),
+    ],
+)
+def test_local_rewards_before_at_and_after_an_observation(local, there, observing, then):
+    """Along +x: one POI 5 m ahead; another 10 m ahead, where the rover does not get."""
+    env, state, _ = scene([(0, 0)], [(5, 0), (2, 8)], coupling=1, local=local, poi_values=(1, 1))
+    state = eqx.tree_at(lambda s: s.poi, state, jnp.array([[5.0, 0.0], [7.0, 0.0]]))
+    found = []
+    for turn in (0, 0, 180):
+        state, now = step(env, state, (turn, 1.0))
+        found.append(float(now.rewards["local"][0]))
+    assert found == [there, observing, then]
+
+
+@pytest.mark.parametrize(
+    ("local", "before", "after"), [("distance", -4, -3), ("closeness", 0.75, 1)]
 )
 def test_the_episode_ends_when_all_are_observed(local, before, after):
     env, state, _ = scene([(0, 0)], [(5, 0)], coupling=1, local=local)

@@ -9,16 +9,18 @@ Departures from the printed box:
 - Line 8 lets every team play with noise; as the text (7.3) and the author's code say, only the
   learner's team does.
 - The box prints no mutation; the text and the code mutate. Operators are those of ERL.
-- Lines 15-21 update critic and policy agent by agent; here one step descends the sum over agents,
-  each of which draws frames of its own. As many steps as frames, scaled by `updates_per_frame`,
-  with no division by the number of agents.
+- Lines 15-21 update critic and policy agent by agent; here one step descends the mean over agents,
+  each of which draws frames of its own. As many steps as frames, times `updates_per_frame`.
+- Line 14 crosses with a single point, always; here rows come from either parent, for members that
+  were drawn before and for a tenth of the others, as the author's code.
 - One buffer of joint frames is an ensemble of one buffer per agent that are written together.
 - "Periodically" is every `migration_period` generations, and the slots are those of the weakest
   teams' offspring, as in ERL. The author's code migrated into any slot and kept four more elites by
   their ancestors' fitness.
 - γ is a field, the same for every method in an experiment; the author had 0.5 here and 0.97 for
   the baselines. Ends of episodes are stored, and learning rates are larger: the author's 5e-5, 1e-5
-  and τ 1e-5 hardly move a network.
+  and τ 1e-5 hardly move a network. Batches have 128 frames (the author's 512), critics relu (tanh),
+  rewards are not multiplied by 10.
 """
 
 from collections.abc import Callable
@@ -36,7 +38,6 @@ from ..evolution.selection import AbstractSelection, Tournament
 from ..learners.base import AbstractLearner
 from ..learners.td3 import TD3, TEAM
 from ..networks.base import AbstractNetwork, AbstractPolicy
-from ..networks.mlp import Critic
 from ..networks.team import Team
 from ..rollout import Environment, collect
 from ..types import Metrics
@@ -53,7 +54,7 @@ from .erl import (
     warm,
 )
 
-LOCAL = TD3(critic=Critic(hidden=(100, 100)), signal="local", **TEAM)
+LOCAL = TD3(signal="local", **TEAM)
 """The learner of the team: one twin critic that all agents share (lines 2 and 16-21)."""
 
 
@@ -79,7 +80,7 @@ class MERL(eqx.Module):
     replay_capacity: int = eqx.field(static=True, default=100_000)  # joint transitions
     test_episodes: int = eqx.field(static=True, default=10)  # of the champion; not counted
     test_every: int = eqx.field(static=True, default=1)  # generations between tests
-    fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
+    fitness: str | None = eqx.field(static=True, default=None)  # signal; None: what is reported
     redistribute: bool = eqx.field(static=True, default=False)  # as in ERL
 
     def __check_init__(self):
@@ -89,13 +90,14 @@ class MERL(eqx.Module):
             require.at_least(name, getattr(self, name), 1)
         require.within("crossover_probability", self.crossover_probability, 0, 1)
         require.at_least("updates_per_frame", self.updates_per_frame, 0)
+        require.fits(self.env, self.network, *self.learners)
         for signal in (self.fitness, *(learner.signal for learner in self.learners)):
             require.signal(signal, self.env.signals)
         require.room(self.elite_fraction, self.population_size, len(self.learners), self.workers)
 
     @classmethod
     def merl(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """The settings of fig-7.4."""
+        """The defaults, for the command line."""
         return cls(env, network or Team(), **overrides)
 
     @classmethod
@@ -114,7 +116,7 @@ class MERL(eqx.Module):
     @property
     def signal(self) -> str:
         """The reward that evolution maximises."""
-        return self.fitness or self.env.signals[0]
+        return self.fitness or self.env.reported
 
     def init(self, *, key: PRNGKeyArray) -> ERLState:
         # 1-4: a population of k multi-head teams; learners with a shared critic; replay buffers.

@@ -147,6 +147,7 @@ class Neuroevolution(eqx.Module):
         )
 
     def init(self, *, key: PRNGKeyArray) -> NeuroevolutionState:
+        require.fits(self.env, self.network)
         # 1: Initialize a population of k neural networks.
         population = self.new_population(key=key)
         k = self.population_size
@@ -180,13 +181,13 @@ class Neuroevolution(eqx.Module):
             "fitness_max": jnp.max(rankable(fitness)),
             "fitness_mean": jnp.nanmean(returns),
             "fitness_nan": jnp.sum(jnp.isnan(returns)),
-            "champion_score": jnp.mean(test.returns[score]),
+            "champion_score": jnp.mean(test.of(score)),
             "frames": jnp.sum(evaluation.steps),
         }
         level = state.level
         if self.curriculum:
             metrics["level"] = level
-            level = self.curriculum.next(level, jnp.mean(evaluation.returns[score][order[0]]))
+            level = self.curriculum.next(level, jnp.mean(evaluation.of(score)[order[0]]))
         return NeuroevolutionState(bred, tree.take(champion, 0), record, age, level), metrics
 
 
@@ -199,7 +200,7 @@ def assess(
     total = jnp.stack([evaluation.of(name) for name in signals]).sum(axis=0)
     returns = jnp.mean(total, axis=1)
     if algorithm.parsimony:
-        score = evaluation.returns[algorithm.score or algorithm.env.reported]
+        score = evaluation.of(algorithm.score or algorithm.env.reported)
         returns = returns + algorithm.parsimony(state.population) * jnp.mean(score, axis=1)
     age = state.age.astype(jnp.float32)
     mixed = (state.record * age + returns) / (age + 1.0)

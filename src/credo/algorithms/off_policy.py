@@ -17,7 +17,7 @@ from .. import require, rollout, tree
 from ..compilation import when
 from ..learners.base import AbstractLearner, learn
 from ..learners.sac import SAC
-from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, ddpg, maddpg, matd3
+from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, TEAM, ddpg, maddpg, matd3
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.team import Team
 from ..replay import Replay, extend
@@ -59,8 +59,11 @@ class OffPolicy(eqx.Module):
 
     @classmethod
     def td3(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """The constants of TD3's authors, second version."""
-        return cls(env, network or (TD3_NETWORK if env.agents is None else Team()), **overrides)
+        """The constants of TD3's authors, second version; for a team those of `matd3`, with critics
+        of each agent's own frames."""
+        if env.agents is not None:
+            return cls.matd3(env, network, **{"learner": TD3(**TEAM)} | overrides)
+        return cls(env, network or TD3_NETWORK, **overrides)
 
     @classmethod
     def ddpg(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:

@@ -66,6 +66,7 @@ class PPO(eqx.Module):
     """Train a policy on its own fresh experience alone."""
 
     default_budget: ClassVar[dict[str, int]] = {"frames": 1_000_000}
+    teams: ClassVar[bool] = False
 
     env: Environment
     network: AbstractNetwork = MLP(

@@ -39,9 +39,10 @@ class PettingZoo(AbstractForeignEnvironment):
 
     Signals: `local` `[agents]`, what each agent earns; `global`, the mean over all rows.
     `terminated`: every agent that took part has terminated; an episode that is over otherwise was
-    truncated. The time limit is `max_episode_steps` or the environment's own `max_cycles`,
-    whichever is less. Whatever goes wrong raises `EnvironmentFailure`, and the next `copies` start
-    a new worker.
+    truncated. Learners take an agent that leaves before the others for one that goes on, and who is
+    not there at the start for one that is. The time limit is `max_episode_steps` or the
+    environment's own `max_cycles`, whichever is less. Whatever goes wrong raises
+    `EnvironmentFailure`, and the next `copies` start a new worker.
     """
 
     id: str = eqx.field(static=True)

@@ -10,14 +10,16 @@ episode; the defaults are those of the author's published code ("as coded" below
 
 Departures from the dissertation:
 
-- Local reward: the closest POI that is still *unobserved* after the step; none left: 0 metres.
+- Whether an observed POI counts as the closest one the text leaves open; it says "the closest POI",
+  so by default it does. Other local rewards are options, and what each of them teaches differs: see
+  `local`.
 - "Outside the centre" leaves the shape open: the centre is a square of a tenth of the field's area.
 
 Departures of the code from the dissertation are options: its speed is 0.5 whatever the action and
 its turn ±90° (`motion`), its sensors look in fixed directions of the world (`observation`), it
-starts on integer cells (`start`), and its local reward is a closeness (`local`). Where it shows and
-pays an observed POI for one step more, here it vanishes in the step that observes it; where it
-counts steps of harvesting in total, here they are consecutive.
+starts on integer cells (`start`), and its local reward is a closeness (`local`). Where it shows an
+observed POI for one step more, here it vanishes in the step that observes it; where it counts steps
+of harvesting in total, here they are consecutive.
 """
 
 import math
@@ -96,15 +98,14 @@ class Rover(AbstractEnvironment):
     **Signals**, those named in `rewards`:
 
     - `global`: share of the POIs' value that was observed, in [0, 1]; paid at the last step.
-    - `local` `[rovers]`, each step: minus the distance in metres to the closest unobserved POI, 0
-      if none is left; or its closeness min(1, `activation_distance` / distance), 1 if none.
+    - `local` `[rovers]`, each step, as the field `local` says.
     - `mixed` `[rovers]`: local + `mixed_weight` · global.
     - `difference` `[rovers]`: D, global minus what it would be without rover i on the same
       trajectories (Agogino & Tumer 2004); paid at the last step.
-    - `dpp` `[rovers]`: D++ (Rahmattalabi et al. 2016): if `coupling` - 1 copies of rover i at its
-      own place would have gained more per copy than D, then that gain per copy for the smallest
-      number m >= 1 of copies that has more of it than m - 1 (for m - 1 = 0: than D); else D.
-      Paid at the last step. More copies than `coupling` - 1 never add anything.
+    - `dpp` `[rovers]`: D++ (Rahmattalabi et al. 2016): if as many copies of rover i at its own
+      place as it has team mates would have gained more per copy than D, then that gain per copy for
+      the smallest number m >= 1 of copies that has more of it than m - 1 (for m - 1 = 0: than D);
+      else D. Paid at the last step. More copies than `coupling` - 1 gain nothing more.
 
     `terminated` once all POIs are observed, `truncated` at `max_steps`.
     """
@@ -121,7 +122,14 @@ class Rover(AbstractEnvironment):
     graded: bool = eqx.field(static=True, default=False)
     """An unobserved POI pays the share max over time of d_a / max(d_a, mean distance of the
     `coupling` closest rovers) of its value (d_a: `activation_distance`)."""
-    local: Literal["distance", "closeness"] = eqx.field(static=True, default="distance")
+    local: Literal["distance", "unobserved", "closeness", "progress"] = eqx.field(
+        static=True, default="distance"
+    )
+    """distance: minus the metres to the closest POI, observed or not; a rover may stay there.
+    unobserved: to the closest of those unobserved before the step; it falls after an observation,
+    so that to hover outside the ring pays. closeness: min(1, d_a / distance) to that one, as coded;
+    the same, and to end the episode costs. progress: metres by which the step came closer to that
+    one; nothing is lost by observing it."""
     rewards: tuple[str, ...] = eqx.field(static=True, default=("global", "local"))
     mixed_weight: float = 10.0
     observation: Literal["relative", "as-coded"] = eqx.field(static=True, default="relative")
@@ -136,7 +144,7 @@ class Rover(AbstractEnvironment):
     def __check_init__(self):
         for name in ("pois", "coupling", "max_steps", "harvest_period"):
             require.at_least(name, getattr(self, name), 1)
-        require.choice("local", self.local, ("distance", "closeness"))
+        require.choice("local", self.local, ("distance", "unobserved", "closeness", "progress"))
         require.choice("observation", self.observation, ("relative", "as-coded"))
         require.choice("motion", self.motion, ("as-written", "as-coded"))
         require.choice("start", self.start, ("continuous", "as-coded"))
@@ -243,13 +251,15 @@ class Rover(AbstractEnvironment):
     def step(
         self, state: RoverState, action: Float[Array, "rovers 2"], *, key: PRNGKeyArray
     ) -> tuple[RoverState, TimeStep]:
+        before, (_, was) = state.observed, _apart(state.position, state.poi)
         position, heading, speed = self._move(state, jnp.clip(action, -1.0, 1.0))
         apart, distance = _apart(position, state.poi)
         ledgers = self._record(state, distance)
         state = RoverState(position, heading, speed, state.poi, *ledgers, state.step + 1)
         terminated = jnp.all(state.observed)
         truncated = ~terminated & (state.step >= self.max_steps)
-        rewards = self._pay(state, distance, terminated | truncated)
+        local = self._local(before, was, distance)
+        rewards = self._pay(state, local, terminated | truncated)
         obs = self._observe(state, apart, distance)
         return state, TimeStep(obs, rewards, terminated, truncated, jnp.ones(self.agents, bool))
 
@@ -351,18 +361,29 @@ class Rover(AbstractEnvironment):
         )
         return d_a / jnp.maximum(d_a, total / n), d_a / jnp.maximum(d_a, total_without / n)
 
+    def _local(
+        self,
+        observed: Bool[Array, " pois"],
+        was: Float[Array, "rovers pois"],
+        distance: Float[Array, "rovers pois"],
+    ) -> Float[Array, " rovers"]:
+        """Each rover's own reward; `observed` and distances `was` before the step."""
+        if self.local == "distance":
+            return -jnp.min(distance, axis=1)
+        left = jnp.where(jnp.all(observed), jnp.zeros_like(observed), observed)[None]
+        if self.local == "progress":
+            mine = jnp.argmin(jnp.where(left, jnp.inf, was), axis=1)[:, None]
+            return jnp.take_along_axis(was - distance, mine, axis=1)[:, 0]
+        closest = jnp.min(jnp.where(left, jnp.inf, distance), axis=1)
+        if self.local == "unobserved":
+            return -closest
+        return self.activation_distance / jnp.maximum(self.activation_distance, closest)
+
     def _pay(
-        self, state: RoverState, distance: Float[Array, "rovers pois"], ended: Bool[Array, ""]
+        self, state: RoverState, local: Float[Array, " rovers"], ended: Bool[Array, ""]
     ) -> dict[str, Array]:
-        rewards = {}
         share = self._share(state.observed, state.nearness)
-        if {"local", "mixed"} & set(self.rewards):
-            closest = jnp.min(jnp.where(state.observed[None], jnp.inf, distance), axis=1)
-            closest = jnp.where(jnp.all(state.observed), 0.0, closest)
-            d_a = self.activation_distance
-            close = self.local == "closeness"
-            rewards["local"] = d_a / jnp.maximum(d_a, closest) if close else -closest
-        rewards["global"] = jnp.where(ended, share, 0.0)
+        rewards = {"local": local, "global": jnp.where(ended, share, 0.0)}
         if "mixed" in self.rewards:
             rewards["mixed"] = rewards["local"] + self.mixed_weight * rewards["global"]
         if state.observed_without is not None:
@@ -395,7 +416,8 @@ class Rover(AbstractEnvironment):
         result = difference
         for more, fewer in reversed(list(zip(gains[1:], gains[:-1], strict=True))):
             result = jnp.where(more > fewer, more, result)  # the smallest m is written last
-        return jnp.where(gains[-1] > difference, result, difference)
+        most = self._share(missing < self.coupling, None) / max(self.agents - 1, 1)
+        return jnp.where(most > difference, result, difference)
 
     def _observe(self, state: RoverState, apart, distance) -> Float[Array, "rovers obs"]:
         """What the sensors say; `apart` and `distance` of rovers and POIs are known already."""

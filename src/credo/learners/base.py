@@ -134,8 +134,12 @@ def features_first(x: Float[Array, "batch *agents size"]) -> Float[Array, "size 
 
 
 def mean(x: Float[Array, "*batch"], active: Bool[Array, "*batch"] | None) -> Float[Array, ""]:
-    """The mean over those who acted."""
-    return jnp.mean(x) if active is None else jnp.mean(x, where=active)
+    """The mean over those who acted; 0 if nobody did."""
+    return jnp.mean(x) if active is None else _mean_where(x, active)
+
+
+def _mean_where(x: Array, active: Array) -> Array:
+    return jnp.sum(x, where=active) / jnp.maximum(jnp.sum(active.astype(x.dtype)), 1.0)
 
 
 def act(

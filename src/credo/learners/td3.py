@@ -18,7 +18,7 @@ from .. import require
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import AbstractNoise, Explorer, GaussianNoise, OrnsteinUhlenbeck
 from ..networks.mlp import MLP, AbstractCritic, AbstractCriticNetwork, Critic, MLPPolicy
-from ..networks.team import JointCritic
+from ..networks.team import JointCritic, TeamPolicy
 from ..types import Batch, Metrics
 from .base import (
     AbstractLearner,
@@ -34,6 +34,7 @@ from .base import (
 TD3_NETWORK = MLP(hidden=(256, 256), activation="relu", initializer="uniform")
 """The actor of TD3's authors, second version."""
 TEAM: dict[str, Any] = {
+    "critic": Critic(hidden=(100, 100)),
     "gamma": 0.97,
     "actor_lr": 1e-3,
     "critic_lr": 1e-3,
@@ -100,7 +101,7 @@ class TD3(AbstractLearner):
         actor_key, critic_key = jax.random.split(key)
         actor = network.init(*sizes, key=actor_key)
         require_memoryless(network, actor)
-        if isinstance(actor, MLPPolicy):
+        if isinstance(actor, MLPPolicy | TeamPolicy):
             actor = actor.scaled(self.actor_scale)
         critics = tuple(
             self.critic.init(*(sizes if self.together else sizes[:2]), key=key)
@@ -208,7 +209,8 @@ def critic_error(
     pair = (features_first(batch.obs), features_first(batch.action))
     qs = [critic(*pair) for critic in critics]
     errors = [mean(jnp.square(q - target), batch.active) for q in qs]
-    return jnp.sum(jnp.stack(errors)), jnp.mean(jnp.stack(qs))
+    values = [mean(q, batch.active) for q in qs]
+    return jnp.sum(jnp.stack(errors)), jnp.mean(jnp.stack(values))
 
 
 def actor_loss(

@@ -19,6 +19,7 @@ from .mlp import (
     AbstractCriticNetwork,
     Critic,
     CriticNetwork,
+    MLPPolicy,
     draw_layers,
     hidden_layers,
 )
@@ -88,6 +89,11 @@ class TeamPolicy(AbstractPolicy):
             return head(hidden_layers(trunk, obs, len(c.trunk), c.activation, "none"), carry)
 
         return self._each(one, obs, carry)
+
+    def scaled(self, factor: Float[Array, ""] | float) -> "TeamPolicy":
+        """With the output layers' weights times `factor`, where heads are perceptrons."""
+        heads = (h.scaled(factor) if isinstance(h, MLPPolicy) else h for h in self.heads)
+        return TeamPolicy(self.trunks, tuple(heads), self.config, self.agents)
 
     def _each(self, function, *rest: PyTree) -> PyTree:
         """`function(trunk, head, *rest)` for every agent. What is shared has no axis of agents, so
