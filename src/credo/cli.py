@@ -62,6 +62,12 @@ ALGORITHMS |= {
         "maddpg": "DDPG for teams, with critics that see the whole team",
     }.items()
 }
+ALGORITHMS["ccea"] = Entry(
+    "credo.algorithms.ccea:CCEA",
+    "ccea",
+    None,
+    "cooperative coevolution, a population per agent (Algorithm 4)",
+)
 ALGORITHMS["ppo"] = Entry(
     "credo.algorithms.ppo:PPO", "ppo", None, "proximal policy optimization, on fresh frames alone"
 )
@@ -78,6 +84,14 @@ TASKS = {
         "credo.environments.rover:Rover",
         "teams look for points of interest, n rovers at once to see one (7.4)",
     ),
+    "extended-tmaze": (
+        "credo.environments.extended_tmaze:ExtendedTMaze",
+        "robots look for a reward that moves; with a static robot or without (4.1)",
+    ),
+    "server-fleet": (
+        "credo.environments.server_fleet:ServerFleet",
+        "servers find out which devices are nefarious (4.2)",
+    ),
     "simple-spread": (
         "credo.environments.simple_spread:SimpleSpread",
         "a team covers landmarks: mpe2.simple_spread_v3 in JAX",
@@ -92,6 +106,7 @@ NETWORKS = {
     "gru": ("credo.networks.recurrent:Recurrent", {"cell": "gru"}, "gated recurrent unit"),
     "lstm": ("credo.networks.recurrent:Recurrent", {"cell": "lstm"}, "long short-term memory"),
     "mlp": ("credo.networks.mlp:MLP", {}, "feed-forward, no memory"),
+    "dmmu": ("credo.networks.dmmu:DMMU", {}, "a team's gates on one shared memory (4.2.1)"),
 }
 EXPERIMENTS = {
     "fig-3.4a": "success by depth, sequence classification",

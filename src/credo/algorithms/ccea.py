@@ -1,0 +1,171 @@
+"""CCEA: Khadka (2019), Algorithm 4, the cooperative coevolution of section 4.1.2 (after Potter & De
+Jong 1994).
+
+Every agent has a population of its own. Individuals are judged by teams that they are drawn into,
+one from each population.
+
+Departures from the printed box:
+
+- Teams are drawn at random (line 5), so that φ is an average and now and then somebody is in none:
+  it has no fitness and ranks last. `teaming="balanced"` draws permutations instead.
+- "Assign reward to each member" (line 8) does not say how several teams make one fitness: it is
+  their mean; `assignment="best"` takes the best (Wiegand et al. 2001). With a private signal, such
+  as the difference reward, each member is assigned its own.
+- All teams of a generation play in the same worlds.
+- The operators are those of Algorithm 2; the author's code drew φ 1 and z 10, and crossed too.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+
+from .. import require, tree
+from ..environments.base import AbstractEnvironment
+from ..evolution.crossover import AbstractCrossover, MaskedCrossover
+from ..evolution.extinction import Extinction
+from ..evolution.mutation import AbstractMutation, MatrixMutation
+from ..evolution.selection import AbstractSelection, Tournament, rankable
+from ..networks.base import AbstractNetwork
+from ..networks.mlp import MLP
+from ..networks.team import Team, TeamPolicy
+from ..rollout import evaluate
+from ..types import Metrics
+from .neuroevolution import breed
+
+
+class CCEAState(eqx.Module):
+    populations: PyTree  # leaves [M, k, ...]; bred, not yet evaluated
+    champion: TeamPolicy  # the best of each population, together
+
+
+class CCEA(eqx.Module):
+    """Coevolve a population of `network` policies for each agent of `env`."""
+
+    default_budget: ClassVar[dict[str, int]] = {"generations": 1_000}
+
+    env: AbstractEnvironment
+    network: AbstractNetwork = MLP(hidden=(20,))  # of one agent
+    population_size: int = eqx.field(static=True, default=100)  # k, of each population
+    elite_fraction: float = eqx.field(static=True, default=0.04)
+    teams: int = eqx.field(static=True, default=5)  # φ: per individual, on average
+    episodes: int = eqx.field(static=True, default=7)  # z: simulations of each team
+    test_episodes: int = eqx.field(static=True, default=15)  # fresh ones, for the champion team
+    teaming: Literal["random", "balanced"] = eqx.field(static=True, default="random")
+    assignment: Literal["mean", "best"] = eqx.field(static=True, default="mean")
+    selection: AbstractSelection = Tournament()
+    mutation: AbstractMutation = MatrixMutation()
+    crossover: AbstractCrossover = MaskedCrossover()
+    crossover_probability: float = 0.0
+    cross_repeated: bool = eqx.field(static=True, default=False)
+    extinction: Extinction = Extinction()
+    fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
+
+    def __check_init__(self):
+        for name in ("teams", "episodes", "test_episodes"):
+            require.at_least(name, getattr(self, name), 1)
+        require.within("crossover_probability", self.crossover_probability, 0, 1)
+        require.choice("teaming", self.teaming, ("random", "balanced"))
+        require.choice("assignment", self.assignment, ("mean", "best"))
+        require.signal(self.fitness, self.env.signals)
+        require.room(self.elite_fraction, self.population_size, 0, 0)
+
+    @classmethod
+    def ccea(cls, env: AbstractEnvironment, network: AbstractNetwork | None = None, **overrides):
+        """The settings of section 4.1.2."""
+        given: dict[str, Any] = {} if network is None else {"network": network}
+        return cls(env, **given | overrides)
+
+    @classmethod
+    def presets(cls) -> dict[str, Callable[..., Self]]:
+        """Settings by name, for the command line."""
+        return {"ccea": cls.ccea}
+
+    @property
+    def elites(self) -> int:
+        return int(self.elite_fraction * self.population_size)
+
+    @property
+    def agents(self) -> int:
+        """M: populations, and members of a team."""
+        return self.env.agents or 1
+
+    @property
+    def signal(self) -> str:
+        """The reward that is assigned."""
+        return self.fitness or self.env.signals[0]
+
+    def new_population(self, *, key: PRNGKeyArray) -> PyTree:
+        return eqx.filter_vmap(lambda key: self.network.init(*self.env.sizes[:2], key=key))(
+            jax.random.split(key, self.population_size)
+        )
+
+    def init(self, *, key: PRNGKeyArray) -> CCEAState:
+        # 1: Initialize M populations of k neural network policies.
+        require.fits(self.env, Team(head=self.network))
+        keys = jax.random.split(key, self.agents)
+        populations = eqx.filter_vmap(lambda key: self.new_population(key=key))(keys)
+        return CCEAState(populations, self.join(tree.take(populations, (slice(None), 0))))
+
+    def generation(self, state: CCEAState, *, key: PRNGKeyArray) -> tuple[CCEAState, Metrics]:
+        """Lines 4-21 of Algorithm 4, and the test of the champion team."""
+        team_key, play_key, breed_key, test_key = jax.random.split(key, 4)
+
+        # 4-6: for i = 1 … kφ: select a network from each population randomly; they are team T_i.
+        members = self.drawn(key=team_key)
+        every = jnp.arange(self.agents)[:, None]
+        teams = self.join(tree.take(state.populations, (every, members)))
+        # 7-8: run z independent simulations for team T_i; assign reward to each of its members.
+        played = evaluate(self.env, teams, self.episodes, key=play_key)
+        fitness = assigned(self, members, played.returns[self.signal])
+        # 9-21: for each population: rank, keep the elites, select, mutate; now and then extinction.
+        best = jnp.argmax(rankable(fitness), axis=1)
+        champion = self.join(tree.take(state.populations, (every[:, 0], best)))
+        populations = eqx.filter_vmap(
+            lambda population, fitness, key: breed(self, population, fitness, key=key)
+        )(state.populations, fitness, jax.random.split(breed_key, self.agents))
+
+        test = evaluate(self.env, tree.stack(champion), self.test_episodes, key=test_key)
+        returns = played.of(self.signal)
+        metrics = {
+            "fitness_max": jnp.max(rankable(jnp.mean(returns, axis=1))),
+            "fitness_mean": jnp.nanmean(returns),
+            "fitness_nan": jnp.sum(jnp.isnan(jnp.mean(returns, axis=1))),
+            "champion_score": jnp.mean(test.of(self.env.reported)),
+            "frames": jnp.sum(played.steps),
+        }
+        return CCEAState(populations, champion), metrics
+
+    def drawn(self, *, key: PRNGKeyArray) -> Int[Array, "agents teams"]:
+        """Who is in which team."""
+        k, agents = self.population_size, self.agents
+        if self.teaming == "random":
+            return jax.random.randint(key, (agents, k * self.teams), 0, k)
+        every = jnp.broadcast_to(jnp.arange(k), (agents, self.teams, k))
+        return jax.random.permutation(key, every, axis=2, independent=True).reshape(agents, -1)
+
+    def join(self, members: PyTree) -> TeamPolicy:
+        """Policies `[agents, ...]` as one team, or `[agents, teams, ...]` as many."""
+        agents = self.agents
+        heads = tuple(tree.take(members, i) for i in range(agents))
+        config = Team(trunk=(), head=self.network, sharing="nothing")
+        return TeamPolicy(({},) * agents, heads, config, agents)
+
+
+def assigned(
+    ccea: CCEA,
+    members: Int[Array, "agents teams"],
+    returns: Float[Array, "teams episodes *agents"],
+) -> Float[Array, "agents k"]:
+    """Fitness of every individual, from the teams that it was in; NaN if there was none."""
+    reward = jnp.mean(returns, axis=1)  # over simulations
+    reward = reward.T if reward.ndim == 2 else jnp.broadcast_to(reward, members.shape)
+    k = ccea.population_size
+    mine = members[:, None, :] == jnp.arange(k)[None, :, None]  # [agents, k, teams]
+    if ccea.assignment == "best":
+        best = jnp.max(jnp.where(mine, rankable(reward)[:, None], -jnp.inf), axis=2)
+        return jnp.where(jnp.any(mine, axis=2), best, jnp.nan)
+    return jnp.mean(jnp.broadcast_to(reward[:, None], mine.shape), axis=2, where=mine)

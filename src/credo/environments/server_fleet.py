@@ -1,0 +1,220 @@
+"""The cybersecurity task: a fleet of proxy servers finds out whose requests are genuine.
+
+Source: Khadka (2019), section 4.2.2; numbers that the dissertation leaves out (the length of an
+episode, what a server sees while it is busy) are those of the author's published code ("as coded").
+
+Departures from the code:
+
+- A request is served once: simultaneous claims on a device's last requests are granted in random
+  order and the others get nothing. There several servers may take the last request, and counts of
+  pending requests go on below zero.
+- The number of busy steps may be drawn from 0, and an observation ends with the server's status.
+"""
+
+from typing import ClassVar, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from .. import require
+from ..types import TimeStep
+from .base import AbstractEnvironment
+
+ACTS, BUSY, AWAY = 1.0, 0.0, -1.0  # a server's status, as observed
+
+
+class FleetState(eqx.Module):
+    genuine: Bool[Array, " devices"]
+    pending: Int[Array, " devices"]  # requests not served yet, at least 0
+    told: Float[Array, "servers devices"]  # ±1 where a server was last told what it had served
+    busy: Int[Array, " servers"]  # steps left in which it cannot act
+    step: Int[Array, ""]
+
+
+class ServerFleet(AbstractEnvironment):
+    """Servers serve requests of devices; the genuine ones pay +1 and the nefarious ones -1.
+
+    Which devices are nefarious is drawn for each episode, and told only by serving them. A server
+    that acts serves one request of the device it chose, if one is pending, and is then `busy`,
+    whether it got one or not.
+
+    **Actions** `[servers, devices]`: the largest number (the first of equals) is the device.
+
+    **Observation** `[servers, obs]`, in this order: the pending requests of every device (counts,
+    zeros while busy, as coded); what the request it just served was worth, a signed one-hot at
+    the device or a scalar, 0 if it got none; and its status: 1 acts at this step, 0 is busy, -1
+    is away. A server that is away sees zeros and that -1. A network can read from the status who
+    takes part; `TimeStep.active` says who acts.
+
+    **Signal** `net`, shared: genuine minus nefarious requests served in this step.
+
+    `truncated` at `max_steps`, never `terminated`.
+    """
+
+    signals: ClassVar[tuple[str, ...]] = ("net",)
+
+    servers: int = eqx.field(static=True, default=10)  # at least 1
+    devices: int = eqx.field(static=True, default=20)  # at least 1
+    requests: int = eqx.field(static=True, default=5)  # pending per device at first, at least 1
+    nefarious: int | tuple[int, int] = eqx.field(static=True, default=(7, 13))
+    """How many devices: a number, or (least, most) to draw it from uniformly."""
+    busy: int | tuple[int, int] = eqx.field(static=True, default=1)
+    """Steps without acting behind each action: a number (1: "synchronous"), or (least, most) to
+    draw it from uniformly for each action ((0, 2): "asynchronous")."""
+    max_steps: int = eqx.field(static=True, default=15)  # length of every episode, at least 1
+    observation: Literal["signed one-hot", "scalar"] = eqx.field(
+        static=True, default="signed one-hot"
+    )
+    told: Literal["once", "until-action"] = eqx.field(static=True, default="once")
+    """How long the worth of a request is observed: one step (as coded; then a server that is busy
+    must pay attention to learn it), or until the server acts again."""
+    status: bool = eqx.field(static=True, default=True)  # whether it is observed
+    schedule: tuple[tuple[int, int], ...] | None = eqx.field(static=True, default=None)
+    """One (joins, leaves) per server: it is away before step `joins` and from step `leaves` on,
+    counted from 0. None: nobody is ever away."""
+    classes: tuple[bool, ...] | None = eqx.field(static=True, default=None)
+    """Whether each device is genuine, the same in every episode; None: drawn by `nefarious`."""
+
+    @classmethod
+    def case_study(cls, classes: tuple[bool, ...] | None = None) -> "ServerFleet":
+        """2 servers, 4 devices with 3 requests each, 2 of them nefarious: section 4.2.4."""
+        return cls(servers=2, devices=4, requests=3, nefarious=2, max_steps=8, classes=classes)
+
+    def __check_init__(self):
+        for name in ("servers", "devices", "requests", "max_steps"):
+            require.at_least(name, getattr(self, name), 1)
+        require.choice("observation", self.observation, ("signed one-hot", "scalar"))
+        require.choice("told", self.told, ("once", "until-action"))
+        low, high = span(self.nefarious)
+        if not 0 <= low <= high <= self.devices:
+            raise ValueError(
+                f"nefarious is {self.nefarious}: it must be a number, or (least, most), "
+                f"in 0..{self.devices}, the devices"
+            )
+        low, high = span(self.busy)
+        if not 0 <= low <= high:
+            raise ValueError(
+                f"busy is {self.busy}: it must be a number of steps of at least 0, or (least, most)"
+            )
+        if self.classes is not None and len(self.classes) != self.devices:
+            raise ValueError(
+                f"classes has {len(self.classes)} entries for {self.devices} devices: give True "
+                "(genuine) or False for each"
+            )
+        self._check_schedule()
+
+    def _check_schedule(self):
+        if self.schedule is None:
+            return
+        if len(self.schedule) != self.servers:
+            raise ValueError(
+                f"schedule has {len(self.schedule)} entries for {self.servers} servers: give "
+                "(joins, leaves) for each"
+            )
+        for server, (joins, leaves) in enumerate(self.schedule):
+            if not 0 <= joins < leaves:
+                raise ValueError(
+                    f"schedule[{server}] is {(joins, leaves)}: it must be (joins, leaves) with "
+                    f"0 <= joins < leaves; (0, {self.max_steps}) is there all the time"
+                )
+
+    @property
+    def agents(self) -> int:
+        return self.servers
+
+    @property
+    def action_size(self) -> int:
+        return self.devices
+
+    @property
+    def obs_size(self) -> int:
+        worth = self.devices if self.observation == "signed one-hot" else 1
+        return self.devices + worth + int(self.status)
+
+    @property
+    def obs_range(self) -> tuple[float, float]:
+        return -1.0, float(self.requests)
+
+    def reset(self, *, key: PRNGKeyArray) -> tuple[FleetState, TimeStep]:
+        if self.classes is not None:
+            return self.begin(jnp.asarray(self.classes))
+        count_key, order_key = jax.random.split(key)
+        low, high = span(self.nefarious)
+        count = jax.random.randint(count_key, (), low, high + 1)
+        return self.begin(jax.random.permutation(order_key, self.devices) >= count)
+
+    def begin(self, genuine: Bool[Array, " devices"]) -> tuple[FleetState, TimeStep]:
+        """An episode with these classes."""
+        state = FleetState(
+            genuine,
+            jnp.full(self.devices, self.requests, jnp.int32),
+            jnp.zeros((self.servers, self.devices)),
+            jnp.zeros(self.servers, jnp.int32),
+            jnp.int32(0),
+        )
+        return state, self._time_step(state, jnp.float32(0.0))
+
+    def step(
+        self, state: FleetState, action: Float[Array, "servers devices"], *, key: PRNGKeyArray
+    ) -> tuple[FleetState, TimeStep]:
+        claim_key, busy_key = jax.random.split(key)
+        acting = self.present(state.step) & (state.busy == 0)
+        chosen = jnp.argmax(action, axis=1)[:, None] == jnp.arange(self.devices)[None]
+        granted = _grant(acting[:, None] & chosen, state.pending, key=claim_key)
+        worth = jnp.where(state.genuine, 1.0, -1.0)[None] * granted.astype(jnp.float32)
+        before = state.told if self.told == "until-action" else jnp.zeros_like(state.told)
+        state = FleetState(
+            state.genuine,
+            state.pending - jnp.sum(granted.astype(jnp.int32), axis=0),
+            jnp.where(acting[:, None], worth, before),
+            jnp.where(acting, self._busy_steps(key=busy_key), jnp.maximum(state.busy - 1, 0)),
+            state.step + 1,
+        )
+        return state, self._time_step(state, jnp.sum(worth))
+
+    def present(self, step: Int[Array, ""]) -> Bool[Array, " servers"]:
+        """Who is in the fleet at a step."""
+        if self.schedule is None:
+            return jnp.ones(self.servers, bool)
+        joins, leaves = jnp.asarray(self.schedule, jnp.int32).T
+        return (joins <= step) & (step < leaves)
+
+    def _busy_steps(self, *, key: PRNGKeyArray) -> Int[Array, " servers"]:
+        low, high = span(self.busy)
+        if low == high:
+            return jnp.full(self.servers, low, jnp.int32)
+        return jax.random.randint(key, (self.servers,), low, high + 1)
+
+    def _time_step(self, state: FleetState, net: Float[Array, ""]) -> TimeStep:
+        present = self.present(state.step)
+        active = present & (state.busy == 0)
+        pending = jnp.where(active[:, None], state.pending.astype(jnp.float32)[None], 0.0)
+        told = jnp.where(present[:, None], state.told, 0.0)
+        if self.observation == "scalar":
+            told = jnp.sum(told, axis=1, keepdims=True)
+        parts = [pending, told]
+        if self.status:
+            parts.append(jnp.where(present, jnp.where(active, ACTS, BUSY), AWAY)[:, None])
+        ends = state.step >= self.max_steps
+        obs = jnp.concatenate(parts, axis=1)
+        return TimeStep(obs, {"net": net}, jnp.bool_(False), ends, active)
+
+
+def span(value: int | tuple[int, int]) -> tuple[int, int]:
+    """(least, most) of a number that may be drawn."""
+    return (value, value) if isinstance(value, int) else value
+
+
+def _grant(
+    claims: Bool[Array, "servers devices"], pending: Int[Array, " devices"], *, key: PRNGKeyArray
+) -> Bool[Array, "servers devices"]:
+    """The claims that are met, as many as are pending, in random order."""
+    ticket, index = jax.random.uniform(key, claims.shape[:1]), jnp.arange(claims.shape[0])
+    # Two equal tickets would both be the next one.
+    earlier = (ticket[None] < ticket[:, None]) | (
+        (ticket[None] == ticket[:, None]) & (index[None] < index[:, None])
+    )
+    ahead = earlier.astype(jnp.float32) @ claims.astype(jnp.float32)
+    return claims & (ahead < pending.astype(jnp.float32)[None])

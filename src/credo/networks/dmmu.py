@@ -1,0 +1,228 @@
+"""DMMU, the Distributed Modular Memory Unit: several MMUs around one shared memory.
+
+Source: Khadka (2019), section 4.2.1, which gives no equations of its own: each agent is an MMU of
+Chapter 3 (equations 3.1-3.5) with its own input, read and write gates and its own output y, and m
+is one memory for all. Reads and writes happen once per agent and step, in an `order`.
+
+The defaults are those of the author's published code ("as coded"): memory of zeros at the start
+of an episode, tanh outputs, agents in the order of their index, weights N(0, 1/fan-in) and biases
+N(0, 0.1²). Departures from that code, which are those of our MMU: the block input sees memory
+(equation 3.1) where the code fed it the last output, and the output has a bias.
+
+Who takes part is read from the observation: its last number is 1 for an agent that acts, 0 for one
+that is busy, and -1 for one that is away, as `ServerFleet` has it. So it passes through everything
+that handles observations (rollouts, recordings, exported policies), any other network may be
+compared on the same task, and the contract of policies stays `(obs, carry)`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from .. import require, tree
+from .base import INITIALIZERS, AbstractNetwork, AbstractPolicy
+from .mmu import MMU, MMUPolicy
+
+ORDERS = ("sequential", "simultaneous", "random")
+ACCESS = ("everyone", "present", "acting")
+
+
+class DMMU(AbstractNetwork):
+    """Config of a team of MMUs with one memory.
+
+    `init` takes the number of agents behind the sizes of one agent's observation and action.
+    """
+
+    team: ClassVar[bool] = True
+
+    hidden: int | tuple[int, ...] = eqx.field(static=True, default=30)
+    """Hidden activations h: of every agent, or one number for each. An agent whose number is not
+    that of the memory cells learns an encoder and a decoder; for the others both are the identity.
+    """
+    memory: int | None = eqx.field(static=True, default=None)  # shared cells; None: the most hidden
+    order: Literal["sequential", "simultaneous", "random"] = eqx.field(
+        static=True, default="sequential"
+    )
+    """`sequential`: by index, and each agent reads what those before it wrote in this step.
+    `simultaneous`: all read the memory of the last step, and their writes are summed. `random`: as
+    sequential, in an order drawn anew for each step."""
+    access: Literal["everyone", "present", "acting"] = eqx.field(static=True, default="present")
+    """Who reads and writes. `present`: who is not away, so also who is busy (as coded). `acting`:
+    only who can act. `everyone`: always all; then observations end without a status."""
+    initializer: str = eqx.field(static=True, default="fan_in")  # normal, fan_in or kaiming
+    bias_std: float = eqx.field(static=True, default=0.1)  # of fresh biases, times that of weights
+
+    def __check_init__(self):
+        sizes = self.hidden if isinstance(self.hidden, tuple) else (self.hidden,)
+        for size in sizes:
+            require.at_least("hidden", size, 1)
+        require.at_least("memory", self.cells, 1)
+        require.choice("order", self.order, ORDERS)
+        require.choice("access", self.access, ACCESS)
+        require.choice("initializer", self.initializer, INITIALIZERS)
+        require.at_least("bias_std", self.bias_std, 0)
+
+    @property
+    def cells(self) -> int:
+        if self.memory is not None:
+            return self.memory
+        return max(self.hidden) if isinstance(self.hidden, tuple) else self.hidden
+
+    def init(
+        self, obs_size: int, action_size: int, agents: int = 1, *, key: PRNGKeyArray
+    ) -> "DMMUPolicy":
+        if isinstance(self.hidden, tuple) and len(self.hidden) != agents:
+            raise ValueError(
+                f"hidden has {len(self.hidden)} sizes for {agents} agents: give one number for "
+                "all, or one for each"
+            )
+        sizes = self.hidden if isinstance(self.hidden, tuple) else (self.hidden,) * agents
+        inputs = obs_size - int(self.access != "everyone")
+        require.at_least("inputs beside the status", inputs, 1)
+        keys = jax.random.split(key, agents)
+        made = (
+            self._cell(size).init(inputs, action_size, key=key)
+            for size, key in zip(sizes, keys, strict=True)
+        )
+        scaled = (
+            jax.tree.map(lambda w: w if w.ndim == 2 else self.bias_std * w, agent) for agent in made
+        )
+        return DMMUPolicy(tuple(scaled), self)
+
+    def _cell(self, hidden: int) -> MMU:
+        coder = "identity" if hidden == self.cells else "learned"
+        return MMU(
+            hidden,
+            self.cells,
+            encoder=coder,
+            decoder=coder,
+            output_activation="tanh",
+            start_memory="zero",
+            initializer=self.initializer,
+        )
+
+
+class DMMUCarry(eqx.Module):
+    """What a team keeps between two steps."""
+
+    outputs: Float[Array, "agents act"]  # y, private: fed back to the agent's own gates
+    memory: Float[Array, " cells"]  # m, shared
+    key: Any = None  # of the orders to come, if they are random
+
+
+class DMMUPolicy(AbstractPolicy):
+    """One MMU per agent. A leaf is a matrix of one agent, so that operators on genomes see what is
+    published."""
+
+    agents: tuple[MMUPolicy, ...]
+    config: DMMU = eqx.field(static=True)
+
+    def start(self, *, key: PRNGKeyArray) -> DMMUCarry:
+        y, m = self.agents[0].start()
+        outputs = jnp.zeros((len(self.agents), *y.shape))
+        return DMMUCarry(outputs, m, key if self.config.order == "random" else None)
+
+    def __call__(
+        self, obs: Float[Array, "agents obs"], carry: DMMUCarry
+    ) -> tuple[Float[Array, "agents act"], DMMUCarry]:
+        action, carry, _ = self.access(obs, carry)
+        return action, carry
+
+    def access(
+        self, obs: Float[Array, "agents obs"], carry: DMMUCarry
+    ) -> tuple[Float[Array, "agents act"], DMMUCarry, Float[Array, "agents cells"]]:
+        """One step, and what each agent added to the memory in it.
+
+        Who takes no part adds nothing, keeps its last output for later, and acts 0.
+        """
+        takes_part, inputs = self._split(obs)
+        step = self._in_random_order if self.config.order == "random" else self._by_index
+        carry, writes = step(inputs, takes_part, carry)
+        return jnp.where(takes_part[:, None], carry.outputs, 0.0), carry, writes
+
+    def without(self, agents: Sequence[int]) -> "DMMUPolicy":
+        """The team that is left when those at these indices go, in the same order.
+
+        Also of a population. ValueError if there is no such agent, or nobody would be left.
+        """
+        self._check(agents)
+        left = [i for i in range(len(self.agents)) if i not in set(agents)]
+        if not left:
+            raise ValueError(f"without agents {sorted(set(agents))} nobody is left: keep one")
+        return self._of(left)
+
+    def with_clones(self, agents: Sequence[int]) -> "DMMUPolicy":
+        """The team and behind it a copy of each agent at these indices (one may occur twice).
+
+        Also of a population. ValueError if there is no such agent.
+        """
+        self._check(agents)
+        return self._of([*range(len(self.agents)), *agents])
+
+    def _check(self, agents: Sequence[int]) -> None:
+        for i in agents:
+            if not 0 <= i < len(self.agents):
+                raise ValueError(f"no agent {i}: this team has 0..{len(self.agents) - 1}")
+
+    def _of(self, index: list[int]) -> "DMMUPolicy":
+        c = self.config
+        if isinstance(c.hidden, tuple):
+            sizes = tuple(c.hidden[i] for i in index)
+            c = dataclasses.replace(c, hidden=sizes, memory=c.cells)
+        return DMMUPolicy(tuple(self.agents[i] for i in index), c)
+
+    def _split(self, obs: Float[Array, "agents obs"]):
+        """Who takes part, and what the networks see."""
+        access = self.config.access
+        if access == "everyone":
+            return jnp.ones(len(self.agents), bool), obs
+        # 1, 0 and -1, apart also under some noise.
+        return obs[:, -1] > (-0.5 if access == "present" else 0.5), obs[:, :-1]
+
+    def _one(self, agent: MMUPolicy, x, y, m, takes_part: Bool[Array, ""]):
+        """Output and memory after one agent's access; as before if it takes no part."""
+        _, after = agent(x, (y, m))
+        return tree.where(takes_part, after, (y, m))
+
+    def _by_index(self, inputs, takes_part, carry: DMMUCarry) -> tuple[DMMUCarry, Array]:
+        at_once = self.config.order == "simultaneous"
+        m, outputs, writes = carry.memory, [], []
+        # Written out: a loop would copy the weights of every agent at every step.
+        for i, agent in enumerate(self.agents):
+            read = carry.memory if at_once else m
+            y, after = self._one(agent, inputs[i], carry.outputs[i], read, takes_part[i])
+            outputs.append(y)
+            writes.append(after - read)
+            m = m + writes[i] if at_once else after
+        return DMMUCarry(jnp.stack(outputs), m, None), jnp.stack(writes)
+
+    def _in_random_order(self, inputs, takes_part, carry: DMMUCarry) -> tuple[DMMUCarry, Array]:
+        n = len(self.agents)
+        key, order_key = jax.random.split(carry.key)
+        order = jax.random.permutation(order_key, n)
+        play = self._any_agent()
+
+        def turn(k, loop):
+            outputs, m, writes = loop
+            i = order[k]
+            y, after = play(i, inputs[i], outputs[i], m, takes_part[i])
+            return outputs.at[i].set(y), after, writes.at[i].set(after - m)
+
+        start = (carry.outputs, carry.memory, jnp.zeros((n, *carry.memory.shape)))
+        outputs, memory, writes = jax.lax.fori_loop(0, n, turn, start)
+        return DMMUCarry(outputs, memory, key), writes
+
+    def _any_agent(self):
+        """`_one` of an agent that is known by a traced index."""
+        if all(agent.config == self.agents[0].config for agent in self.agents):
+            team = tree.stack(*self.agents)
+            return lambda i, *seen: self._one(tree.take(team, i), *seen)
+        # Weights of different sizes are no rows of one array.
+        branches = [functools.partial(self._one, agent) for agent in self.agents]
+        return lambda i, *seen: jax.lax.switch(i, branches, *seen)

@@ -1,0 +1,89 @@
+"""CCEA: who is in which team, what each member is assigned, and that agents coevolve."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from credo import tree
+from credo.algorithms.ccea import CCEA, assigned
+from credo.environments.probes import Meet
+from credo.networks.mlp import MLP
+
+SMALL = CCEA(Meet(), MLP(hidden=(4,)), population_size=6, elite_fraction=0.2, teams=3, episodes=2)
+
+
+def test_random_teams_are_k_phi_draws_from_each_population():
+    many = CCEA(Meet(), population_size=20, elite_fraction=0.1, teams=50)
+    members = np.asarray(many.drawn(key=jax.random.key(0)))
+    assert members.shape == (2, 1000)
+    counts = [np.bincount(row, minlength=20) for row in members]
+    assert abs(np.mean(counts) - 50) < 1e-9
+    assert 4 < np.std(counts) < 10  # binomial: 6.9
+    assert (members[0] != members[1]).mean() > 0.9
+
+
+def test_balanced_teams_have_everybody_equally_often():
+    balanced = CCEA(Meet(), population_size=7, elite_fraction=0.2, teams=4, teaming="balanced")
+    members = np.asarray(balanced.drawn(key=jax.random.key(0)))
+    assert [np.bincount(row).tolist() for row in members] == [[4] * 7] * 2
+    assert (members[0] != members[1]).any()
+
+
+def test_fitness_is_the_mean_or_best_over_the_teams_of_a_member():
+    members = jnp.array([[0, 0, 1, 1, 3], [2, 0, 2, 2, 2]])
+    returns = jnp.array([[1.0, 3.0], [4.0, 4.0], [0.0, 0.0], [8.0, 6.0], [5.0, 5.0]])
+    ccea = CCEA(Meet(), population_size=4, elite_fraction=0.25)
+    nan = np.nan
+    np.testing.assert_allclose(
+        assigned(ccea, members, returns),
+        [[3.0, 3.5, nan, 5.0], [4.0, nan, (2 + 0 + 7 + 5) / 4, nan]],
+    )
+    best = CCEA(Meet(), population_size=4, elite_fraction=0.25, assignment="best")
+    np.testing.assert_allclose(
+        assigned(best, members, returns), [[4.0, 7.0, nan, 5.0], [4.0, nan, 7.0, nan]]
+    )
+
+
+def test_of_a_private_signal_each_member_is_assigned_its_own():
+    members = jnp.array([[0, 1], [1, 1]])
+    returns = jnp.array([[[1.0, 10.0]], [[2.0, 30.0]]])  # [teams, episodes, agents]
+    ccea = CCEA(Meet(), population_size=2, elite_fraction=0.5)
+    np.testing.assert_allclose(assigned(ccea, members, returns), [[1.0, 2.0], [np.nan, 20.0]])
+
+
+def test_a_generation_keeps_the_elite_of_each_population_and_joins_them():
+    state = SMALL.init(key=jax.random.key(0))
+    after, metrics = SMALL.generation(state, key=jax.random.key(1))
+    assert float(metrics["frames"]) >= 6 * 3 * 2 * 4  # at least four steps an episode
+    for i, head in enumerate(after.champion.heads):
+        elite = tree.take(after.populations, (i, 0))
+        for a, b in zip(jax.tree.leaves(head), jax.tree.leaves(elite), strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert float(metrics["fitness_max"]) >= float(metrics["fitness_mean"])
+
+
+@pytest.mark.parametrize("fitness", [None, "local"])
+def test_two_populations_learn_to_meet(fitness):
+    ccea = CCEA(
+        Meet(), MLP(hidden=(4,)), population_size=16, elite_fraction=0.1, teams=2, fitness=fitness
+    )
+    state = ccea.init(key=jax.random.key(0))
+    for g in range(8):
+        state, metrics = ccea.generation(state, key=jax.random.key(g))
+    assert float(metrics["champion_score"]) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"teaming": "fair"}, "teaming is 'fair': it must be one of balanced, random"),
+        ({"assignment": "sum"}, "assignment is 'sum': it must be one of best, mean"),
+        ({"teams": 0}, "teams is 0: it must be at least 1"),
+        ({"fitness": "score"}, "no reward signal 'score': this task has global, local"),
+        ({"elite_fraction": 0.001}, "elite_fraction is 0.001 of 100 members"),
+    ],
+)
+def test_bad_settings_say_what_is_allowed(fields, told):
+    with pytest.raises(ValueError, match=told):
+        CCEA(Meet(), **fields)
