@@ -13,6 +13,7 @@ import pytest
 
 from credo import cli
 from credo.environments.gymnasium import Gymnasium
+from credo.environments.probes import Meet
 from credo.networks.mlp import MLP
 from credo.runs.loop import Run
 
@@ -288,8 +289,9 @@ def test_several_seeds_are_trained_in_processes_of_their_own(credo, run, tmp_pat
 
 
 def test_every_algorithm_is_made_of_its_preset():
-    env = Gymnasium("Pendulum-v1", in_process=True)
+    alone = Gymnasium("Pendulum-v1", in_process=True)
     for name, entry in cli.ALGORITHMS.items():
+        env = Meet() if name in ("merl", "matd3", "maddpg") else alone
         build = cli._builder(name, entry.preset)
         network = None if entry.network is None else MLP()
         algorithm = build(env, network)
@@ -498,3 +500,93 @@ def test_a_champion_of_another_network_is_refused_with_both(credo, tmp_path):
     assert "give the same --preset or --network" in err
     assert "hidden=(4,)" in err
     assert "hidden=(128, 128)" in err
+
+
+# Teams
+
+MERL = (
+    "--rovers 3 --coupling 2 --pois 2 --max-steps 4 --size 8 --network.trunk 4 "
+    "--population-size 4 --elite-fraction 0.25 --episodes 2 --workers 2 --test-episodes 2 "
+    "--warmup-frames 30 --replay-capacity 100 --migration-period 3 --fitness global "
+    "--updates-per-frame 0.1 --tensorboard False"
+)
+
+
+def test_a_team_of_rovers_is_trained_with_the_flags_of_its_parts(credo, tmp_path):
+    path = tmp_path / "run"
+    code, out, err = credo(f"train merl rover {MERL} --generations 3 --seed 2 --path {path}")
+    assert code == 0, err
+    assert out.startswith(f"{path}: generation 3, best fitness ")
+    run = Run(path)
+    algorithm = run.algorithm
+    assert type(algorithm) is cli._load("credo.algorithms.merl:MERL")
+    env = algorithm.env
+    assert (env.agents, env.coupling, env.pois, env.max_steps, env.size) == (3, 2, 2, 4, 8.0)
+    assert (algorithm.network.trunk, algorithm.network.sharing) == ((4,), "trunk")
+    assert (algorithm.population_size, algorithm.elites, algorithm.workers) == (4, 1, 2)
+    assert (algorithm.migration_period, algorithm.fitness) == (3, "global")
+    assert [learner.signal for learner in algorithm.learners] == ["local"]
+    assert run.metrics["generation"].tolist() == [1, 2, 3]
+    assert 0 < run.metrics["frames"][-1] <= 3 * (4 * 2 + 2) * 4
+    assert run.metrics["updates"].max() > 0
+    code, out, _ = credo(f"evaluate {path} --episodes 5")
+    assert code == 0
+    assert out.splitlines()[0] == f"{path}: 5 fresh episodes"
+    assert {"global", "local"} <= {line.split()[0] for line in out.splitlines()[1:]}
+    code, out, _ = credo(f"resume {path} --generations 4")
+    assert code == 0
+    assert out.startswith(f"{path}: generation 4,")
+
+
+def test_a_team_of_pettingzoo_is_trained_by_its_name(credo, tmp_path):
+    pytest.importorskip("mpe2")
+    path = tmp_path / "run"
+    flags = (
+        "--max-episode-steps 4 --network.trunk 4 --learner.critic.critic.hidden 4 "
+        "--learner.batch-size 4 --learner.gamma 0.5 --episodes 2 --start-frames 5 "
+        "--updates-per-frame 0.5 --test-episodes 1 --replay-capacity 50 --tensorboard False"
+    )
+    words = f"train matd3 mpe2.simple_spread_v3 {flags} --frames 16 --path {path}"
+    code, out, err = credo(words)
+    assert code == 0, err
+    assert out.startswith(f"{path}: generation 2,")
+    run = Run(path)
+    assert (run.algorithm.env.id, run.algorithm.env.agents) == ("mpe2.simple_spread_v3", 3)
+    learner = run.algorithm.learner
+    assert (learner.together, learner.critics, learner.gamma) == (True, 2, 0.5)
+    assert learner.critic.critic.hidden == (4,)
+    assert run.metrics["frames"].tolist() == [8, 16]
+    assert run.metrics["updates"].tolist() == [4, 4]
+    assert run.metrics["champion_score"][-1] < 0.0  # minus the distances to the landmarks
+
+
+def test_list_shows_what_teams_need(credo):
+    out = credo("list")[1]
+    for name in ("merl", "matd3", "maddpg", "rover", "simple-spread", "fig-7.1", "fig-7.4"):
+        assert f"\n  {name} " in out
+    assert "mpe2.simple_spread_v3" in credo("list tasks")[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("train sac rover", "MLP acts for one agent and Rover has 6: put it on a team"),
+        ("train ppo rover", "MLP acts for one agent and Rover has 6: put it on a team"),
+        ("train cerl rover", "MLP acts for one agent and Rover has 6"),
+        ("train neuroevolution rover", "MMU acts for one agent and Rover has 6"),
+        ("train matd3 Pendulum-v1", "Team acts for a team and Pendulum-v1 has one agent"),
+        ("train matd3 Pendulum-v1 --network mlp", "one agent"),
+        ("train merl Pendulum-v1", "Team acts for a team and Pendulum-v1 has one agent"),
+        ("train merl rover --coupling 0", "coupling"),
+        ("train merl rover --fitness fun", "no reward signal 'fun': this task has global, local"),
+        ("train mrl rover", "did you mean 'merl'?"),
+        ("train merl rovr", "did you mean 'rover'?"),
+    ],
+)
+def test_a_task_and_an_algorithm_that_do_not_go_together(credo, words, told, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = credo(f"{words} --frames 1")
+    assert (code, out) == (2, "")
+    assert told in err.splitlines()[-1]
+    assert err.startswith("credo: ")
+    assert list(tmp_path.iterdir()) == []  # nothing was begun

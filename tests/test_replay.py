@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from compilations import compilations
 
-from credo import replay
+from credo import replay, tree
 from credo.replay import Replay
 from credo.types import Transition
 
@@ -168,3 +168,100 @@ def test_shapes_alone_need_no_memory(monkeypatch):
 def test_this_machine_says_its_memory():
     with pytest.raises(ValueError, match="give a smaller capacity"):
         Replay.empty(ROW, 10**15)
+
+
+# Teams: one row is a joint frame.
+
+AGENTS = 3
+TEAM_ROW = Transition(
+    jnp.zeros((AGENTS, 2)),
+    jnp.zeros((AGENTS, 1)),
+    {"global": jnp.float32(0.0), "local": jnp.zeros(AGENTS)},
+    jnp.zeros((AGENTS, 2)),
+    jnp.bool_(False),
+    jnp.bool_(False),
+    jnp.zeros(AGENTS, bool),
+)
+
+
+def frames(numbers):
+    """Joint frames that say their number in every field, and in private ones the agent."""
+    i = np.asarray(numbers, np.float32)
+    own = i[:, None] + np.arange(AGENTS, dtype=np.float32) / 4
+    obs = np.stack([own, -own], axis=2)
+    rewards = {"global": 2 * i, "local": 3 * own}
+    acts = (i[:, None] + np.arange(AGENTS)) % 2 == 0
+    return Transition(obs, 10 * own[:, :, None], rewards, obs + 0.5, i % 3 == 0, i % 5 == 0, acts)
+
+
+def assert_frames(sample):
+    """That every entry is the agent's own part of one frame: the frames' numbers, `[n, agents]`."""
+    found = np.floor(np.asarray(sample.obs)[:, :, 0])
+    n = len(found)
+    expected = frames(found.ravel())
+    for agent in range(AGENTS):
+        part = np.arange(n) * AGENTS + agent  # this agent's frames
+        jax.tree.map(
+            lambda x, y, agent=agent, part=part: np.testing.assert_array_equal(
+                x[:, agent], y[part] if y.ndim == 1 else y[part, agent]
+            ),
+            sample,
+            expected,
+        )
+    return found.astype(int)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_teams_sample_has_an_axis_of_agents_everywhere(together):
+    ring = replay.extend(Replay.empty(TEAM_ROW, 8), frames(np.arange(1, 7)))
+    sample = ring.sample(40, together=together, key=jax.random.key(0))
+    shapes = jax.tree.map(jnp.shape, sample)
+    assert shapes.obs == shapes.next_obs == (40, AGENTS, 2)
+    assert shapes.action == (40, AGENTS, 1)
+    assert shapes.rewards == {"global": (40, AGENTS), "local": (40, AGENTS)}
+    assert shapes.terminated == shapes.truncated == shapes.active == (40, AGENTS)
+    found = assert_frames(sample)
+    assert set(found.ravel().tolist()) == set(range(1, 7))
+    assert (found == found[:, :1]).all() == together
+
+
+def test_each_agent_draws_frames_of_its_own():
+    """Uniformly, and independently of the others."""
+    ring = replay.extend(Replay.empty(TEAM_ROW, CAPACITY), frames(np.arange(1, CAPACITY + 1)))
+    n = 5000
+    apart, joint = (
+        assert_frames(ring.sample(n, together=together, key=jax.random.key(2))) - 1
+        for together in (False, True)
+    )
+    pairs = [np.bincount(CAPACITY * x[:, 0] + x[:, 2], minlength=25) for x in (apart, joint)]
+    expected = n / CAPACITY**2
+    # The 0.999 quantile of chi-squared with 24 degrees of freedom.
+    assert np.sum((pairs[0] - expected) ** 2 / expected) < 51.2
+    assert np.sum((pairs[1] - expected) ** 2 / expected) > 10 * n / CAPACITY
+    counts = np.bincount(joint[:, 0], minlength=CAPACITY)
+    assert np.sum((counts - n / CAPACITY) ** 2 / (n / CAPACITY)) < 18.5
+
+
+def test_a_ring_of_joint_frames_goes_round():
+    ring, by_hand = Replay.empty(TEAM_ROW, CAPACITY), Ring(CAPACITY)
+    for turn, mask in enumerate(np.array([[1, 0, 1], [1, 1, 1], [0, 1, 1], [0, 0, 1]], bool)):
+        new = 3 * turn + np.arange(1, 4)
+        ring = replay.extend(ring, jax.tree.map(jnp.asarray, frames(new)), jnp.asarray(mask))
+        by_hand.extend(new[mask].tolist())
+        kept = by_hand.held()
+        filled = tree.take(ring.data, jnp.arange(len(kept)))
+        jax.tree.map(np.testing.assert_array_equal, filled, frames(kept))
+    assert (by_hand.written, int(ring.position), int(ring.size)) == (8, 3, CAPACITY)
+    found = assert_frames(ring.sample(60, key=jax.random.key(0)))
+    assert set(found.ravel().tolist()) == set(by_hand.held())
+
+
+def test_a_team_of_one_draws_as_one_agent_does():
+    own = frames(np.arange(1, 6))
+    one = jax.tree.map(lambda x: x if x.ndim == 1 else x[:, :1], own)
+    alone = jax.tree.map(lambda x: x if x.ndim == 1 else x[:, 0], own)
+    samples = []
+    for data in (one, alone):
+        row = jax.tree.map(lambda x: jnp.asarray(x[0]), data)
+        samples.append(replay.extend(Replay.empty(row, 5), data).sample(9, key=jax.random.key(1)))
+    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[:, 0], y), *samples)

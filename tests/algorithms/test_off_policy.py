@@ -18,10 +18,12 @@ from credo.compilation import jit
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy, Meet
 from credo.environments.wrappers import delayed
+from credo.learners import td3 as learners
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3, ddpg
 from credo.networks.exploration import OrnsteinUhlenbeck
 from credo.networks.mlp import MLP, Critic
+from credo.networks.team import Team
 
 FAST = {"actor_lr": 0.01, "critic_lr": 0.01, "tau": 0.05, "gamma": 0.5, "batch_size": 64}
 CRITIC = Critic(hidden=(16,))
@@ -174,7 +176,6 @@ def test_a_policy_that_goes_on_is_tested_at_once():
     [
         (Gymnasium("CartPole-v1", in_process=True), "CartPole-v1 has Discrete actions"),
         (delayed(Gymnasium("CartPole-v1", in_process=True)), "has Discrete actions"),
-        (Meet(), "Meet has 2 agents"),
     ],
 )
 def test_tasks_without_a_gradient_are_refused(build, env, told):
@@ -210,7 +211,7 @@ def test_a_host_task_and_the_same_in_jax_start_alike():
 
 def test_presets_have_the_constants_of_their_authors():
     presets = {name: make(Copy()) for name, make in OffPolicy.presets().items()}
-    assert set(presets) == {"td3", "ddpg", "sac"}
+    assert set(presets) == {"td3", "ddpg", "sac", "matd3", "maddpg"}
     td3, sac = presets["td3"], presets["sac"]
     assert isinstance(td3.learner, TD3)
     assert (td3.start_frames, td3.network.hidden, td3.learner.policy_delay) == (
@@ -223,6 +224,12 @@ def test_presets_have_the_constants_of_their_authors():
     assert (presets["ddpg"].start_frames, presets["ddpg"].learner.critics) == (1_000, 1)
     assert isinstance(sac.learner, SAC)
     assert (sac.start_frames, sac.learner.target_entropy) == (10_000, -1.0)
+    matd3, maddpg = presets["matd3"], presets["maddpg"]
+    assert (matd3.learner, maddpg.learner) == (learners.matd3(), learners.maddpg())
+    assert matd3.network == maddpg.network == Team()
+    assert (matd3.episodes, matd3.start_frames, matd3.updates_per_frame) == (10, 5_000, 0.1)
+    assert dataclasses.replace(matd3, learner=maddpg.learner) == maddpg
+    assert OffPolicy.td3(Meet()).network == Team()
     own = OffPolicy.sac(Copy(), MLP(hidden=(2,)), start_frames=5)
     assert (own.network, own.start_frames) == (MLP(hidden=(2,)), 5)
 

@@ -20,13 +20,27 @@ SMALL = (
     "--network.hidden 8 --warmup-frames 200 --replay-capacity 5000 --test-every 3 "
     "--updates-per-frame 0.02 --max-episode-steps 40"
 )
+TEAM = (
+    "credo.environments.probes:Meet --network.trunk 8 --updates-per-frame 0.05 "
+    "--replay-capacity 2000 --test-episodes 2"
+)
 TRAIN = {
     "neuroevolution": "neuroevolution sequence-classification --depth 3 --min-gap 1 --max-gap 3 "
     "--population-size 20 --episodes 5 --network.hidden 3",
     "erl": f"erl InvertedPendulum-v5 {SMALL} --sync-period 2",
     "cerl": f"cerl InvertedPendulum-v5 {SMALL}",
+    "merl": f"merl {TEAM} --population-size 6 --elite-fraction 0.34 --episodes 2 --workers 4 "
+    "--warmup-frames 200 --test-every 3 --migration-period 2",
+    "matd3": f"matd3 {TEAM} --learner.critic.critic.hidden 8 --learner.batch-size 16 "
+    "--episodes 4 --start-frames 100 --test-every 100",
 }
-GENERATIONS = {"neuroevolution": 100_000, "erl": 300, "cerl": 150}  # enough for 20 kills
+GENERATIONS = {  # enough for 20 kills
+    "neuroevolution": 100_000,
+    "erl": 300,
+    "cerl": 150,
+    "merl": 30_000,
+    "matd3": 30_000,
+}
 
 
 def start(run: pathlib.Path, what: str, generations: int) -> subprocess.Popen:

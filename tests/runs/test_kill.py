@@ -3,6 +3,8 @@
 import importlib.util
 import pathlib
 
+import pytest
+
 path = pathlib.Path(__file__).with_name("kill.py")
 specification = importlib.util.spec_from_file_location("kill", path)
 assert specification is not None
@@ -16,6 +18,16 @@ def test_killed_three_times(tmp_path):
     assert kill.rows(tmp_path / "killed") > 2  # dispatches, so there was something to kill
     newest = sorted(p.name for p in (tmp_path / "killed" / "checkpoints").iterdir())[-1]
     assert newest == "00000600"
+
+
+@pytest.mark.parametrize(("what", "generations"), [("merl", 2000), ("matd3", 3000)])
+def test_teams_killed_once_while_they_train(tmp_path, what, generations):
+    assert kill.compare(tmp_path, 1, generations, seed=10, what=what) == []
+    newest = sorted(p.name for p in (tmp_path / "killed" / "checkpoints").iterdir())[-1]
+    assert newest == f"{generations:08d}"
+    columns, *_, last = (tmp_path / "killed" / "metrics.csv").read_text().splitlines()
+    told = dict(zip(columns.split(","), last.split(","), strict=True))
+    assert int(told["updates"]) > 0  # it had learned
 
 
 def test_a_difference_would_be_seen(tmp_path):
