@@ -79,10 +79,13 @@ def cell(
     budget: str,
     planned: Plan,
     first_seed: int = 0,
+    network: Team | None = None,
     **settings: Any,
 ) -> Cell:
     """Runs of a method; `settings`: fields of those that have a population."""
     algorithm = build(method, env, planned.updates_per_frame)
+    if network is not None:
+        algorithm = dataclasses.replace(algorithm, network=network)
     if isinstance(algorithm, MERL):
         algorithm = dataclasses.replace(algorithm, **settings)
     if budget == "smoke":

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 
 from ..environments.rover import Rover
+from ..evolution.mutation import MatrixMutation
+from ..networks.team import Team
 from ..runs.loop import Run
 from ..runs.page import Table
 from . import chapter7
@@ -22,13 +24,22 @@ BUDGETS = chapter7.BUDGETS
 PLANS = {
     "smoke": Plan(1_000, 2),
     "quick": Plan(100_000, 2),
-    "full": Plan(600_000, 5),
+    "full": Plan(400_000, 5),
     "published": Plan(2_000_000, 5),
 }
-# With MERL's own settings and minus the distance as the local reward, four of five runs of 200,000
-# frames (seeds 0 to 4) found one POI; with these, seeds 1 to 4 found both.
-SETTINGS = {"population_size": 50, "episodes": 2, "workers": 10}
-FRESH = 100
+# What sets one rover apart from the other must be able to change alone: with a shared trunk and
+# mutation of all matrices at once about half of MERL's runs found both POIs.
+TEAM = Team(sharing="nothing")
+MUTATION = MatrixMutation(
+    gate="matrix",
+    probability=0.2,
+    fraction=0.3,
+    super_probability=0.2,
+    reset_probability=0.05,
+    vectors=False,
+)
+SETTINGS = {"population_size": 50, "episodes": 5, "workers": 10, "mutation": MUTATION}
+FRESH = 200  # chosen by looking at others
 METHODS = ("merl", "ea", "td3 mixed", "td3 global", "td3 local")
 WHERE = "motivating example"
 PUBLISHED_SHARE = {"merl": "1.00 (4 of 5)", "ea": "0.50", "td3 mixed": "0.50", "td3 global": "0"}
@@ -37,14 +48,14 @@ PUBLISHED_SHARE = {"merl": "1.00 (4 of 5)", "ea": "0.50", "td3 mixed": "0.50", "
 def cells(budget: str) -> list[Cell]:
     plan = PLANS[budget]
     return [
-        chapter7.cell(method, task(method), WHERE, budget, plan, FRESH, **SETTINGS)
+        chapter7.cell(method, task(method), WHERE, budget, plan, FRESH, TEAM, **SETTINGS)
         for method in METHODS
     ]
 
 
 def task(method: str) -> Rover:
-    """With the author's local reward."""
-    return Rover.motivating(local="closeness", rewards=chapter7.task(method).rewards)
+    """With the local reward of fig-7.4."""
+    return Rover.motivating(local="progress", rewards=chapter7.task(method).rewards)
 
 
 def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
@@ -79,7 +90,10 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         chapter7.scores(measured, published),
         *chapter7.curves(measured),
         chapter7.about(
-            "0.5 is one POI of two. Rovers start at fixed places, with any heading. The local "
-            "reward is the author's, min(1, d_a / distance).",
+            "0.5 is one POI of two. Rovers start at fixed places, with any heading. Every rover "
+            "has a network of its own, and evolution changes matrices one by one; with a shared "
+            "trunk and ERL's operators about half of MERL's runs on other seeds found both. These "
+            "settings were searched for MERL alone, the learners' are those of fig-7.4. The local "
+            "reward is progress towards the closest POI that is left.",
         ),
     ]
