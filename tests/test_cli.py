@@ -570,8 +570,8 @@ def test_list_shows_what_teams_need(credo):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("train sac rover", "MLP acts for one agent and Rover has 6: put it on a team"),
-        ("train ppo rover", "MLP acts for one agent and Rover has 6: put it on a team"),
+        ("train sac rover", "Rover has 6 agents: SAC cannot learn that. Evolve without a learner"),
+        ("train ppo rover", "Rover has 6 agents: PPO cannot learn that. Evolve without a learner"),
         ("train cerl rover", "MLP acts for one agent and Rover has 6"),
         ("train neuroevolution rover", "MMU acts for one agent and Rover has 6"),
         ("train matd3 Pendulum-v1", "Team acts for a team and Pendulum-v1 has one agent"),

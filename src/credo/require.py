@@ -31,10 +31,10 @@ def signal(given: str | None, known: tuple[str, ...]) -> None:
 def fits(env: Any, network: Any, *learners: Any) -> None:
     """A network that acts for as many agents as the task has, and learners that can learn it."""
     team = env.agents is not None
-    if network.team != team:
-        raise ValueError(_other_team(env, network))
     if learners and (env.discrete or (team and not all(learner.teams for learner in learners))):
         raise ValueError(_cannot_learn(env, learners))
+    if network.team != team:
+        raise ValueError(_other_team(env, network))
 
 
 def _other_team(env: Any, network: Any) -> str:
@@ -51,7 +51,8 @@ def _cannot_learn(env: Any, learners: tuple[Any, ...]) -> str:
     has = "Discrete actions" if env.discrete else f"{env.agents} agents"
     return (
         f"{getattr(env, 'id', type(env).__name__)} has {has}: "
-        f"{', '.join(type(x).__name__ for x in learners)} cannot learn that. Evolve without a "
+        f"{', '.join(type(x).__name__ for x in learners if env.discrete or not x.teams)} cannot "
+        "learn that. Evolve without a "
         "learner (credo train ea), or give a task with Box actions; teams learn by TD3 (credo "
         "train merl, matd3)"
     )
