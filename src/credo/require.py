@@ -33,6 +33,8 @@ def fits(env: Any, network: Any, *learners: Any) -> None:
     team = env.agents is not None
     if learners and (env.discrete or (team and not all(learner.teams for learner in learners))):
         raise ValueError(_cannot_learn(env, learners))
+    if not team and any(getattr(learner, "together", False) for learner in learners):
+        raise ValueError(_one_alone(env))
     if network.team != team:
         raise ValueError(_other_team(env, network))
 
@@ -44,6 +46,13 @@ def _other_team(env: Any, network: Any) -> str:
     return (
         f"{name} acts for one agent and {task} has {env.agents}: put it on a team, as in "
         f"Team(head={name}(...))"
+    )
+
+
+def _one_alone(env: Any) -> str:
+    return (
+        f"{getattr(env, 'id', type(env).__name__)} has one agent and the critic is one of a team: "
+        "give Critic(...), as td3 and ddpg have"
     )
 
 

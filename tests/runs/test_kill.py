@@ -20,7 +20,7 @@ def test_killed_three_times(tmp_path):
     assert newest == "00000600"
 
 
-@pytest.mark.parametrize(("what", "generations"), [("merl", 2000), ("matd3", 3000)])
+@pytest.mark.parametrize(("what", "generations"), [("merl", 800), ("matd3", 1200)])
 def test_teams_killed_once_while_they_train(tmp_path, what, generations):
     assert kill.compare(tmp_path, 1, generations, seed=10, what=what) == []
     newest = sorted(p.name for p in (tmp_path / "killed" / "checkpoints").iterdir())[-1]

@@ -107,6 +107,7 @@ class ERL(eqx.Module):
             require.at_least(name, getattr(self, name), least)
         for name in ("sync_period", "replay_capacity", "test_episodes", "test_every"):
             require.at_least(name, getattr(self, name), 1)
+        require.fits(self.env, self.network, *self.learners)
         require.within("crossover_probability", self.crossover_probability, 0, 1)
         require.at_least("updates_per_frame", self.updates_per_frame, 0)
         for signal in (self.fitness, *(learner.signal for learner in self.learners)):
@@ -255,7 +256,6 @@ class Hybrid(Protocol):
 def begin(hybrid: Hybrid, *, key: PRNGKeyArray) -> ERLState:
     """1-4: Initialize learners, a population of k actors, and an empty cyclic replay buffer."""
     env, network, k, q = hybrid.env, hybrid.network, hybrid.population_size, len(hybrid.learners)
-    require.fits(env, network, *hybrid.learners)
     population_key, *learner_keys = jax.random.split(key, 1 + q)
     learners = tuple(
         learner.init(network, *env.sizes, key=learner_key)

@@ -90,6 +90,7 @@ class Neuroevolution(eqx.Module):
             ("elite_memory", 1),
         ):
             require.at_least(name, getattr(self, name), minimum)
+        require.fits(self.env, self.network)
         require.within("elite_fraction", self.elite_fraction, 0, 1)
         require.within("crossover_probability", self.crossover_probability, 0, 1)
         if self.elites >= self.population_size:
@@ -147,7 +148,6 @@ class Neuroevolution(eqx.Module):
         )
 
     def init(self, *, key: PRNGKeyArray) -> NeuroevolutionState:
-        require.fits(self.env, self.network)
         # 1: Initialize a population of k neural networks.
         population = self.new_population(key=key)
         k = self.population_size

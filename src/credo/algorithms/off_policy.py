@@ -53,6 +53,7 @@ class OffPolicy(eqx.Module):
     def __check_init__(self):
         for name in ("episodes", "test_episodes", "test_every", "replay_capacity"):
             require.at_least(name, getattr(self, name), 1)
+        require.fits(self.env, self.network, self.learner)
         require.at_least("start_frames", self.start_frames, 0)
         require.at_least("updates_per_frame", self.updates_per_frame, 0)
         require.signal(self.learner.signal, self.env.signals)
@@ -97,7 +98,6 @@ class OffPolicy(eqx.Module):
 
     def init(self, *, key: PRNGKeyArray) -> OffPolicyState:
         env = self.env
-        require.fits(env, self.network, self.learner)
         learner = self.learner.init(self.network, *env.sizes, key=key)
         replay = Replay.empty(blank(env), self.replay_capacity)
         actor = self.learner.actor(learner)

@@ -89,6 +89,7 @@ class PPO(eqx.Module):
     signal: str | None = eqx.field(static=True, default=None)  # reward; None: the task's first
 
     def __check_init__(self):
+        require.fits(self.env, self.network, self)
         for name in ("horizon", "copies", "epochs", "batch_size", "test_episodes", "test_every"):
             require.at_least(name, getattr(self, name), 1)
         for name in ("gamma", "gae"):
@@ -110,7 +111,6 @@ class PPO(eqx.Module):
 
     def init(self, *, key: PRNGKeyArray) -> PPOState:
         env = self.env
-        require.fits(env, self.network, self)
         actor_key, critic_key = jax.random.split(key)
         mean = self.network.init(env.obs_size, env.action_size, key=actor_key)
         require_memoryless(self.network, mean)

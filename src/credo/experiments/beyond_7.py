@@ -51,7 +51,7 @@ def cells(budget: str) -> list[Cell]:
         if budget == "smoke":
             network = algorithm.network
             algorithm = dataclasses.replace(chapter7.shrunk(algorithm), network=network)
-        name = f"{name.replace(',', ' /')}, coupling 4"
+        name = f"{name.replace(',', ' /')}, coupling 4, all rewards"
         found.append(Cell(name, algorithm, None, plan.runs, 0, plan.frames))
     return found
 

@@ -30,9 +30,11 @@ EPISODES = 100
 
 def cells(budget: str) -> list[Cell]:
     plan, env = PLANS[budget], chapter7.task("matd3 mixed", coupling=3)
-    full = [chapter7.cell(m, env, "coupling 3", budget, plan) for m in ("merl", "matd3 mixed")]
+    full = [
+        chapter7.cell(m, env, "coupling 3, paths", budget, plan) for m in ("merl", "matd3 mixed")
+    ]
     partly = plan._replace(frames=PARTLY[budget])
-    return [chapter7.cell("merl", env, "coupling 3, partly trained", budget, partly), *full]
+    return [chapter7.cell("merl", env, "coupling 3, paths, partly trained", budget, partly), *full]
 
 
 def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
