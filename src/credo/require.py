@@ -33,10 +33,10 @@ def fits(env: Any, network: Any, *learners: Any) -> None:
     team = env.agents is not None
     if learners and (env.discrete or (team and not all(learner.teams for learner in learners))):
         raise ValueError(_cannot_learn(env, learners))
-    if not team and any(getattr(learner, "together", False) for learner in learners):
-        raise ValueError(_one_alone(env))
     if network.team != team:
         raise ValueError(_other_team(env, network))
+    if not team and any(getattr(learner, "together", False) for learner in learners):
+        raise ValueError(_one_alone(env))
 
 
 def _other_team(env: Any, network: Any) -> str:

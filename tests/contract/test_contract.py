@@ -1,5 +1,7 @@
 """One battery over every member of each family: whoever joins is listed here."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -115,7 +117,7 @@ def test_networks(name):
     assert batch[0].shape == (N, action_size)
     assert_float32(batch)
     assert (np.abs(batch[0]) <= 1.0).all()
-    assert type(net)(**{f: getattr(net, f) for f in net.__dataclass_fields__}) == net
+    assert dataclasses.replace(net) == net
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
