@@ -31,12 +31,19 @@ def signal(given: str | None, known: tuple[str, ...]) -> None:
 def fits(env: Any, network: Any, *learners: Any) -> None:
     """A network that acts for as many agents as the task has, and learners that can learn it."""
     team = env.agents is not None
-    if learners and (env.discrete or (team and not all(learner.teams for learner in learners))):
-        raise ValueError(_cannot_learn(env, learners))
+    unfit = [learner for learner in learners if team and not learner.teams]
+    if unfit:
+        raise ValueError(_cannot_learn(env, f"{env.agents} agents", unfit))
     if network.team != team:
         raise ValueError(_other_team(env, network))
     if not team and any(getattr(learner, "together", False) for learner in learners):
         raise ValueError(_one_alone(env))
+
+
+def continuous(env: Any, *learners: Any) -> None:
+    """Actions that learners can follow a gradient through. It opens a task outside JAX."""
+    if learners and env.discrete:
+        raise ValueError(_cannot_learn(env, "Discrete actions", learners))
 
 
 def _other_team(env: Any, network: Any) -> str:
@@ -56,14 +63,12 @@ def _one_alone(env: Any) -> str:
     )
 
 
-def _cannot_learn(env: Any, learners: tuple[Any, ...]) -> str:
-    has = "Discrete actions" if env.discrete else f"{env.agents} agents"
+def _cannot_learn(env: Any, has: str, learners: Iterable[Any]) -> str:
     return (
         f"{getattr(env, 'id', type(env).__name__)} has {has}: "
-        f"{', '.join(type(x).__name__ for x in learners if env.discrete or not x.teams)} cannot "
-        "learn that. Evolve without a "
-        "learner (credo train ea), or give a task with Box actions; teams learn by TD3 (credo "
-        "train merl, matd3)"
+        f"{', '.join(type(learner).__name__ for learner in learners)} cannot learn that. Evolve "
+        "without a learner (credo train ea), or give a task with Box actions; teams learn by TD3 "
+        "(credo train merl, matd3)"
     )
 
 

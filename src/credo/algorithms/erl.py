@@ -256,6 +256,7 @@ class Hybrid(Protocol):
 def begin(hybrid: Hybrid, *, key: PRNGKeyArray) -> ERLState:
     """1-4: Initialize learners, a population of k actors, and an empty cyclic replay buffer."""
     env, network, k, q = hybrid.env, hybrid.network, hybrid.population_size, len(hybrid.learners)
+    require.continuous(env, *hybrid.learners)
     population_key, *learner_keys = jax.random.split(key, 1 + q)
     learners = tuple(
         learner.init(network, *env.sizes, key=learner_key)

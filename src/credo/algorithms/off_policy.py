@@ -98,6 +98,7 @@ class OffPolicy(eqx.Module):
 
     def init(self, *, key: PRNGKeyArray) -> OffPolicyState:
         env = self.env
+        require.continuous(env, self.learner)
         learner = self.learner.init(self.network, *env.sizes, key=key)
         replay = Replay.empty(blank(env), self.replay_capacity)
         actor = self.learner.actor(learner)

@@ -111,6 +111,7 @@ class PPO(eqx.Module):
 
     def init(self, *, key: PRNGKeyArray) -> PPOState:
         env = self.env
+        require.continuous(env, self)
         actor_key, critic_key = jax.random.split(key)
         mean = self.network.init(env.obs_size, env.action_size, key=actor_key)
         require_memoryless(self.network, mean)
