@@ -82,7 +82,7 @@ def test_the_check_of_baselines_says_what_is_to_be_beaten():
             "score": [[-20.0, -9.0]],
             "final": [-9.0],
             "played": [2],
-            "random": -26.0,
+            "reference": {"random": -26.0},
         }
     }
     table = check_spread.sections(measured)[1]

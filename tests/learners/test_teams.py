@@ -62,7 +62,7 @@ def same(a, b):
     return all(np.array_equal(x, y, equal_nan=True) for x, y in pairs)
 
 
-def close(a, b, atol=1e-6):
+def assert_close(a, b, atol=1e-6):
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_allclose(x, y, atol=atol)
 
@@ -202,9 +202,9 @@ def test_a_team_of_one_learns_as_one_agent_does(name):
         team, told = update(learner, team, batch, key)
         single = jax.tree.map(lambda x: x[:, 0], batch)
         alone, expected = update(alone_learner, alone, single, key)
-        close(told, expected, atol=1e-5)
-        close(actor_of(team), alone.actor.weights, atol=1e-5)
-        close(critics_of(team), [c.weights for c in alone.critics], atol=1e-5)
+        assert_close(told, expected, atol=1e-5)
+        assert_close(actor_of(team), alone.actor.weights, atol=1e-5)
+        assert_close(critics_of(team), [c.weights for c in alone.critics], atol=1e-5)
 
 
 def garbage(batch, fields):
@@ -232,7 +232,7 @@ def test_who_did_not_act_changes_nothing(name):
         update(LEARNERS[name], start(name), b, jax.random.key(0))
         for b in (batch, garbage(batch, fields))
     ]
-    close(results[0], results[1], atol=1e-5)
+    assert_close(results[0], results[1], atol=1e-5)
     everybody = eqx.tree_at(lambda b: b.active, batch, np.ones_like(batch.active))
     other, _ = update(LEARNERS[name], start(name), everybody, jax.random.key(0))
     assert not same(other.actor, results[0][0].actor)
@@ -254,7 +254,7 @@ def test_everybody_acts_where_nobody_says_who_does(name):
     full = eqx.tree_at(lambda b: b.active, batch, np.ones_like(batch.active))
     none = eqx.tree_at(lambda b: b.active, batch, None)
     told, silent = (update(LEARNERS[name], start(name), b, jax.random.key(0)) for b in (full, none))
-    close(told, silent, atol=1e-5)
+    assert_close(told, silent, atol=1e-5)
 
 
 # Through replay
@@ -286,11 +286,11 @@ def test_a_reward_of_all_is_the_reward_of_each(name, rows):
         signal: learn(learner, start(name), ring(rows), jnp.int32(3), signal=signal, key=key)[0]
         for signal in rows.rewards
     }
-    close(states["shared"], states["private"])
+    assert_close(states["shared"], states["private"])
     assert not same(states["shared"].critics, states["other"].critics)
     own = dataclasses.replace(learner, signal="other")
     named, _ = learn(own, start(name), ring(rows), jnp.int32(3), signal="shared", key=key)
-    close(named, states["other"])
+    assert_close(named, states["other"])
 
 
 @pytest.mark.parametrize("name", ["td3", "matd3"])
@@ -306,7 +306,7 @@ def test_agents_learn_from_the_same_frames_if_a_critic_sees_them_all(name, rows)
         x.obs, x.action, x.rewards["other"], x.next_obs, x.terminated, x.truncated, x.active
     )
     expected, told = update(learner, start(name), batch, update_key)
-    close((learned, metrics), (expected, told), atol=1e-5)
+    assert_close((learned, metrics), (expected, told), atol=1e-5)
 
 
 def test_frames_in_which_an_agent_did_not_act_do_not_reach_it(rows):
@@ -331,7 +331,7 @@ def test_frames_in_which_an_agent_did_not_act_do_not_reach_it(rows):
         )[0]
         for r in (rows, other)
     )
-    close((a.actor, a.critics), (b.actor, b.critics), atol=1e-5)
+    assert_close((a.actor, a.critics), (b.actor, b.critics), atol=1e-5)
 
 
 # Settings

@@ -13,6 +13,7 @@ Departures from the printed box:
   as the difference reward, each member is assigned its own.
 - All teams of a generation play in the same worlds.
 - The operators are those of Algorithm 2; the author's code drew φ 1 and z 10, and crossed too.
+- Feed-forward networks have their biases mutated; the author's code left those alone.
 """
 
 from collections.abc import Callable
@@ -65,6 +66,7 @@ class CCEA(eqx.Module):
     fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
 
     def __check_init__(self):
+        require.fits(self.env, Team(head=self.network))
         for name in ("teams", "episodes", "test_episodes"):
             require.at_least(name, getattr(self, name), 1)
         require.within("crossover_probability", self.crossover_probability, 0, 1)
@@ -91,7 +93,7 @@ class CCEA(eqx.Module):
     @property
     def agents(self) -> int:
         """M: populations, and members of a team."""
-        return self.env.agents or 1
+        return self.env.sizes[2]
 
     @property
     def signal(self) -> str:
@@ -105,7 +107,6 @@ class CCEA(eqx.Module):
 
     def init(self, *, key: PRNGKeyArray) -> CCEAState:
         # 1: Initialize M populations of k neural network policies.
-        require.fits(self.env, Team(head=self.network))
         keys = jax.random.split(key, self.agents)
         populations = eqx.filter_vmap(lambda key: self.new_population(key=key))(keys)
         return CCEAState(populations, self.join(tree.take(populations, (slice(None), 0))))
@@ -160,7 +161,11 @@ def assigned(
     members: Int[Array, "agents teams"],
     returns: Float[Array, "teams episodes *agents"],
 ) -> Float[Array, "agents k"]:
-    """Fitness of every individual, from the teams that it was in; NaN if there was none."""
+    """Fitness of every individual, from the teams that it was in; NaN if there was none.
+
+    **Arguments:** `members[i, t]`: who of population i is in team t. `returns` of a private signal
+    have an axis of agents.
+    """
     reward = jnp.mean(returns, axis=1)  # over simulations
     reward = reward.T if reward.ndim == 2 else jnp.broadcast_to(reward, members.shape)
     k = ccea.population_size

@@ -1,6 +1,7 @@
 """Chapter 7 on the rover domain: the methods that are compared, and their scores."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -120,11 +121,19 @@ def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
     return {name: outcome(name, cell) for name, cell in runs.items()}
 
 
-def outcome(name: str, runs: list[Run]) -> dict[str, Any]:
-    """Curves of the champion's tests, and the final champions in fresh worlds that they share."""
+def outcome(
+    name: str,
+    runs: list[Run],
+    episodes: int = EPISODES,
+    reference: Callable[[Any], dict[str, float]] | None = None,
+) -> dict[str, Any]:
+    """Curves of the champion's tests, and the final champions in fresh worlds that they share.
+
+    **Arguments:** `reference`: floors and ceilings of the task; by default those of `references`.
+    """
     env = runs[0].algorithm.env
     champions = tree.stack(*(run.champion for run in runs))
-    played = evaluate(env, champions, EPISODES, key=jax.random.key(20_000))
+    played = evaluate(env, champions, episodes, key=jax.random.key(20_000))
     metrics = [run.metrics for run in runs]
     xs = [m["frames"] for m in metrics]
     grid = attribution.axis(xs, POINTS)
@@ -142,7 +151,7 @@ def outcome(name: str, runs: list[Run]) -> dict[str, Any]:
         "updates per frame": attribution.plain(
             [m["updates"].sum() / m["frames"][-1] for m in metrics], 3
         ),
-        "reference": references(env),
+        "reference": (reference or references)(env),
     }
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from .. import tree
 from ..algorithms.off_policy import OffPolicy
-from ..analysis import attribution
+from ..analysis import planner
 from ..environments.simple_spread import SimpleSpread
 from ..learners.td3 import maddpg, matd3
 from ..networks.exploration import GaussianNoise
@@ -74,36 +74,14 @@ def _algorithm(name: str, plan: Plan, budget: str) -> OffPolicy:
 
 
 def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return {name: _outcome(name.partition(",")[0], cell) for name, cell in runs.items()}
+    return {name: chapter7.outcome(name, cell, EPISODES, random) for name, cell in runs.items()}
 
 
-def _outcome(name: str, runs: list[Run]) -> dict[str, Any]:
-    env = runs[0].algorithm.env
-    champions = tree.stack(*(run.champion for run in runs))
-    played = evaluate(env, champions, EPISODES, key=jax.random.key(20_000))
-    metrics = [run.metrics for run in runs]
-    xs = [m["frames"] for m in metrics]
-    grid = attribution.axis(xs, chapter7.POINTS)
-    return {
-        "method": name,
-        "frames": grid.astype(int).tolist(),
-        "score": [
-            attribution.plain(attribution.on_grid(x, m["champion_score"], grid), 2)
-            for x, m in zip(xs, metrics, strict=True)
-        ],
-        "final": attribution.plain(np.mean(played.of("global"), axis=1), 2),
-        "played": [int(x[-1]) for x in xs],
-        "random": round(_random(env), 2),
-    }
-
-
-def _random(env: SimpleSpread) -> float:
+def random(env: SimpleSpread) -> dict[str, float]:
     """Mean return of actions drawn uniformly."""
-    learner = matd3(critic=JointCritic(Critic(hidden=(1,))))
-    state = learner.init(Team(trunk=()), *env.sizes, key=jax.random.key(0))
-    anybody = tree.stack(learner.explorer(state, jax.numpy.bool_(True)))
+    anybody = tree.stack(planner.RandomTeam(env.agents))
     played = evaluate(env, anybody, EPISODES, key=jax.random.key(21_000))
-    return float(np.mean(played.of("global")))
+    return {"random": round(float(np.mean(played.of("global"))), 2)}
 
 
 def sections(measured: dict[str, Any]) -> list[Any]:
@@ -113,7 +91,10 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         "frames",
         "return of the actor, mean per agent",
         [Curve(cell["method"], cell["frames"], cell["score"]) for cell in measured.values()],
-        references=(Reference("random", any_cell["random"]), Reference("a script", -7.5)),
+        references=(
+            Reference("random", any_cell["reference"]["random"]),
+            Reference("a script", -7.5),
+        ),
     )
     table = Table(
         "Return per episode, mean over agents",
@@ -121,7 +102,7 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         [
             [
                 cell["method"],
-                cell["random"],
+                cell["reference"]["random"],
                 PUBLISHED_SCORES[cell["method"]],
                 BOUNDS[cell["method"]],
                 middle(cell["final"]),
