@@ -291,7 +291,7 @@ def test_several_seeds_are_trained_in_processes_of_their_own(credo, run, tmp_pat
 def test_every_algorithm_is_made_of_its_preset():
     alone = Gymnasium("Pendulum-v1", in_process=True)
     for name, entry in cli.ALGORITHMS.items():
-        env = Meet() if name in ("merl", "matd3", "maddpg") else alone
+        env = Meet() if name in ("merl", "matd3", "maddpg", "ccea") else alone
         build = cli._builder(name, entry.preset)
         network = None if entry.network is None else MLP()
         algorithm = build(env, network)

@@ -107,6 +107,12 @@ NETWORKS = {
     "lstm": ("credo.networks.recurrent:Recurrent", {"cell": "lstm"}, "long short-term memory"),
     "mlp": ("credo.networks.mlp:MLP", {}, "feed-forward, no memory"),
     "dmmu": ("credo.networks.dmmu:DMMU", {}, "a team's gates on one shared memory (4.2.1)"),
+    "lstmsm": (
+        "credo.networks.dmmu:DMMU",
+        {"cell": "lstm"},
+        "a team's LSTMs with one cell (4.2.3)",
+    ),
+    "cnf": ("credo.networks.team:Centralized", {}, "one network acts for a whole team (4.2.3)"),
 }
 EXPERIMENTS = {
     "fig-3.4a": "success by depth, sequence classification",
@@ -260,7 +266,7 @@ def _train(argv: list[str]) -> None:
     build, network = _builder(names[0], preset), None
     if network_name:
         path, fields, _ = NETWORKS[network_name]
-        network = _load(path)(**fields)
+        network = _on_a_team(names[0], env, _load(path)(**fields))
     prog = f"credo train {names[0]} {names[1]}"
     if delayed:
         from .environments import wrappers
@@ -279,6 +285,15 @@ def _train(argv: list[str]) -> None:
     _guarded(lambda: _start(algorithm, label, **fields))
 
 
+def _on_a_team(algorithm: str, env: Any, network: Any) -> Any:
+    """A network of one agent for every agent of a task; CCEA has them one by one anyway."""
+    if env.agents is None or network.team or algorithm == "ccea":
+        return network
+    from .networks.team import Team
+
+    return Team(trunk=(), head=network, sharing="nothing")
+
+
 def _train_usage() -> str:
     return f"""\
 usage: credo train ALGORITHM TASK [--network NAME] [--preset NAME] [--delayed] [--from RUN] [flags]
@@ -289,6 +304,7 @@ tasks:      {", ".join(TASKS)}
             or a team of PettingZoo, such as mpe2.simple_spread_v3
             or package.module:Class
 networks:   {", ".join(NETWORKS)} (default: the algorithm's own)
+            each agent of a team has a network of its own, unless it is one for teams
 presets:    {", ".join(PRESETS)} (default: as-written), of neuroevolution
             ours, of erl: for a reward that comes late
 

@@ -14,9 +14,15 @@ from credo import rollout, tree
 from credo.algorithms.neuroevolution import Neuroevolution, breed
 from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
+from credo.environments.server_fleet import ServerFleet
+from credo.evolution.agents import AgentCrossover
+from credo.evolution.crossover import MaskedCrossover, OnePointCrossover
 from credo.evolution.curriculum import Curriculum
 from credo.evolution.mutation import MatrixMutation
+from credo.networks.dmmu import DMMU
+from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
+from credo.networks.team import Centralized
 
 TASK = SequenceClassification(depth=3, min_gap=1, max_gap=2)
 ALGORITHM = Neuroevolution(
@@ -174,6 +180,56 @@ def test_repeated_survivors_are_crossed(start):
             assert set().union(*row_parents(child, start.population)) <= {parents[i], *ELITES}
             changed += not same(child, parent)  # an elite may be crossed with itself
     assert changed >= 4
+
+
+def test_offspring_mate_with_each_other_behind_mutation(start):
+    """Algorithm 5, lines 15-23: both parents are of S, one of them the offspring itself."""
+    fitness = jnp.arange(20.0)
+    alone = ancestors(breed(QUIET, start.population, fitness, key=KEY), start)
+    mating = dataclasses.replace(QUIET, mating=(MaskedCrossover(part="matrix"),))
+    bred = breed(mating, start.population, fitness, key=KEY)
+    assert all(same(tree.take(bred, i), tree.take(start.population, alone[i])) for i in range(4))
+    mates = set()
+    for i in range(4, 20):
+        parents = list(row_parents(tree.take(bred, i), start.population))
+        others = set().union(*parents) - {alone[i]}
+        assert any(alone[i] in found for found in parents)
+        assert len(others) <= 1
+        mates |= others
+    assert mates <= set(alone[4:])
+    assert len(mates) >= 4
+
+
+def test_algorithm_5_as_a_preset():
+    fleet = ServerFleet(servers=2, devices=3, nefarious=1)
+    team = Neuroevolution.dmmu(fleet, DMMU(hidden=3))
+    assert team.mating == (OnePointCrossover(0.05), AgentCrossover(0.05))
+    assert (team.population_size, team.elites, team.episodes, team.test_episodes) == (
+        100,
+        4,
+        10,
+        10,
+    )
+    assert (team.extinction.probability, team.extinction.magnitude) == (0.004, 0.5)
+    assert (team.mutation.gate, team.mutation.probability, team.mutation.strength) == (
+        "matrix",
+        0.9,
+        0.1,
+    )
+    central = Neuroevolution.dmmu(fleet, Centralized(MLP(hidden=(3,))), population_size=30)
+    assert central.mating == (OnePointCrossover(0.05),)
+    assert central.population_size == 30
+
+
+def test_a_fleet_learns_by_algorithm_5():
+    """One of two devices is nefarious: who sticks to one earns 0 on average."""
+    fleet = ServerFleet(servers=2, devices=2, requests=3, nefarious=1, max_steps=5)
+    team = Neuroevolution.dmmu(fleet, DMMU(hidden=3), population_size=30, episodes=20)
+    team = dataclasses.replace(team, elite_fraction=0.1, test_episodes=100)
+    state, key = team.init(key=KEY), jax.random.key(1)
+    for g in range(60):
+        state, metrics = team.generation(state, key=jax.random.fold_in(key, g))
+    assert float(metrics["champion_score"]) > 0.5
 
 
 def test_extinction_spares_the_elites(start):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from credo.evolution.crossover import MaskedCrossover
+from credo.evolution.crossover import MaskedCrossover, OnePointCrossover
 
 CHILDREN = 400
 A = {"m": jnp.arange(12.0).reshape(4, 3), "v": jnp.arange(4.0), "n": jnp.arange(2), "none": None}
@@ -53,6 +53,25 @@ def test_entries_go_alone():
     assert uniform_along(m, 2) == pytest.approx(0.3**3 + 0.7**3, abs=0.06)
 
 
+def test_from_one_point_on_rows_are_the_other_parents():
+    m, v = children(OnePointCrossover(probability=0.5))
+    assert uniform_along(m, 2) == 1.0
+    for mask in (m.all(axis=2), v):
+        assert (np.diff(mask.astype(int), axis=1) >= 0).all()  # once begun, to the end
+        counts = np.bincount(mask.sum(axis=1), minlength=5) / CHILDREN
+        np.testing.assert_allclose(counts, [0.5, *[0.125] * 4], atol=0.1)
+    assert (m.any(axis=(1, 2)) != v.any(axis=1)).any()  # matrices independently
+
+
+def test_one_row_alone_is_taken():
+    m, v = children(OnePointCrossover(probability=0.5, taken="row"))
+    assert uniform_along(m, 2) == 1.0
+    for mask in (m.all(axis=2), v):
+        assert set(mask.sum(axis=1)) == {0, 1}
+        assert mask.sum(axis=1).mean() == pytest.approx(0.5, abs=0.1)
+        assert mask.any(axis=0).all()
+
+
 @pytest.mark.parametrize("part", ["matrix", "row", "entry"])
 @pytest.mark.parametrize(("probability", "share"), [(0.0, 0.0), (1.0, 1.0)])
 def test_the_bounds_copy_one_parent(part, probability, share):
@@ -70,3 +89,5 @@ def test_a_key_is_a_child():
 def test_an_unknown_part_is_refused():
     with pytest.raises(ValueError, match=r"part is 'column'.*entry, matrix, row"):
         MaskedCrossover(part="column")
+    with pytest.raises(ValueError, match=r"taken is 'rows'.*rest, row"):
+        OnePointCrossover(taken="rows")

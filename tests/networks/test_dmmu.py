@@ -37,7 +37,7 @@ def play(policy, obs):
 
     def body(carry, x):
         action, carry, writes = policy.access(x, carry)
-        kept = (carry.outputs, carry.memory)
+        kept = (carry.private, carry.memory)
         return carry, (action, *kept, writes)
 
     return jax.lax.scan(body, policy.start(key=KEY), obs)[1]
@@ -261,3 +261,42 @@ def test_wrong_agents_are_named():
         UNEQUAL.init(OBS, ACT, 2, key=KEY)
     with pytest.raises(ValueError, match="inputs beside the status is 0"):
         SAME.init(1, ACT, 2, key=KEY)
+
+
+# Other cells around one memory
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("cell", ["lstm", "gru", "rnn"])
+def test_the_state_of_other_cells_is_the_memory_of_all(cell, order):
+    """By hand: the agents' own networks, in turn, with what the last one left."""
+    config = DMMU(cell=cell, hidden=4, order=order, access="everyone")
+    policy, obs = made(config), observations()
+    actions, private, memory, writes = (np.asarray(x) for x in play(policy, obs))
+    key, m = KEY, jnp.zeros(4)
+    own = [jnp.zeros(4)] * AGENTS
+    for t, x in enumerate(obs):
+        turns = list(range(AGENTS))
+        if order == "random":
+            key, order_key = jax.random.split(key)
+            turns = np.asarray(jax.random.permutation(order_key, AGENTS)).tolist()
+        read = m
+        for k in turns:
+            seen = read if order == "simultaneous" else m
+            agent = policy.agents[k]
+            if cell == "lstm":
+                action, (own[k], after) = agent(x[k], (own[k], seen))
+                np.testing.assert_allclose(private[t, k], own[k], atol=1e-6)
+            else:
+                action, after = agent(x[k], seen)
+            np.testing.assert_allclose(actions[t, k], action, atol=1e-6)
+            np.testing.assert_allclose(writes[t, k], after - seen, atol=1e-6)
+            m = m + (after - seen)
+        np.testing.assert_allclose(memory[t], m, atol=1e-5)
+
+
+def test_a_state_has_one_unit_for_each_memory_cell():
+    with pytest.raises(ValueError, match="memory is 3: agents of cell 'lstm' have one unit for"):
+        DMMU(cell="lstm", hidden=2, memory=3)
+    with pytest.raises(ValueError, match="cell is 'ntm'"):
+        DMMU(cell="ntm")

@@ -12,7 +12,7 @@ from credo import tree
 from credo.networks.mlp import MLP, Critic
 from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
-from credo.networks.team import JointCritic, Team
+from credo.networks.team import Centralized, JointCritic, Team
 
 OBS, ACT, AGENTS = 3, 2, 4
 KEY = jax.random.key(0)
@@ -332,3 +332,30 @@ def test_a_critic_of_one_agent_knows_no_others(batch):
     np.testing.assert_array_equal(critic.own(obs, action, done), critic(obs, action))
     alone = np.stack([critic(obs[..., k], action[..., k]) for k in range(AGENTS)], axis=1)
     np.testing.assert_allclose(critic(obs, action), alone, atol=1e-6)
+
+
+# One network for all
+
+
+@pytest.mark.parametrize("network", [MLP(hidden=(3,)), MMU(hidden=2)], ids=["mlp", "mmu"])
+def test_one_network_sees_everybody_and_acts_for_everybody(network):
+    policy = made(Centralized(network))
+    obs = observations(1, 2)
+    carry, alone = policy.start(key=KEY), policy.policy.start(key=KEY)
+    for x in obs:
+        action, carry = act(policy, x, carry)
+        expected, alone = policy.policy(x.reshape(-1), alone)
+        assert action.shape == (AGENTS, ACT)
+        np.testing.assert_allclose(action.reshape(-1), expected, atol=1e-6)
+    other = obs[0].at[0].add(1.0)  # what the first one sees moves what the last one does
+    moved = first(policy, other) - first(policy, obs[0])
+    assert np.abs(moved[-1]).max() > 1e-4
+
+
+def test_members_are_all_weights_of_an_agent():
+    apart = made(TEAMS["nothing"])
+    turned = apart.with_members(apart.members[::-1])
+    obs = observations()
+    np.testing.assert_allclose(first(turned, obs[::-1])[::-1], first(apart, obs), atol=1e-6)
+    assert made(TEAMS["trunk"]).members is None
+    assert made(TEAMS["everything"]).members is None

@@ -62,6 +62,7 @@ class CCEA(eqx.Module):
     crossover: AbstractCrossover = MaskedCrossover()
     crossover_probability: float = 0.0
     cross_repeated: bool = eqx.field(static=True, default=False)
+    mating: tuple[AbstractCrossover, ...] = ()  # as in Neuroevolution
     extinction: Extinction = Extinction()
     fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
 

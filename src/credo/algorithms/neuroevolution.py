@@ -1,12 +1,15 @@
-"""Neuroevolution: Khadka (2019), Algorithm 2.
+"""Neuroevolution: Khadka (2019), Algorithm 2; and Algorithm 5, the evolution of teams with a DMMU,
+as its preset `dmmu`.
 
-Departures from the printed box:
+Departures from the printed boxes:
 
 - The box leaves the mutation probability and the share of perturbed weights open; the defaults
   are 0.9 and 0.1, the values of the dissertation's later chapters.
 - Crossover, extinction and a curriculum are fields that the box does not have; all are off by
   default. `as_coded` switches on what the author's program did.
 - Elites are never mutated. The author's program mutated them and kept an untouched copy.
+- Algorithm 5 draws a member of S for each operator k - e times; here every member of S is mutated
+  once, and crossed once by each operator with a random other one as its mate.
 """
 
 from collections.abc import Callable
@@ -22,13 +25,15 @@ from .. import require, tree
 from ..compilation import jit
 from ..environments.base import AbstractEnvironment, AbstractSequenceTask
 from ..environments.sequence_classification import SequenceClassification
-from ..evolution.crossover import AbstractCrossover, MaskedCrossover
+from ..evolution.agents import AgentCrossover
+from ..evolution.crossover import AbstractCrossover, MaskedCrossover, OnePointCrossover
 from ..evolution.curriculum import Curriculum
 from ..evolution.extinction import Extinction
 from ..evolution.mutation import AbstractMutation, MatrixMutation
 from ..evolution.parsimony import Parsimony
 from ..evolution.selection import AbstractSelection, Tournament, rankable, ranking, repeated
 from ..networks.base import AbstractNetwork
+from ..networks.dmmu import DMMU
 from ..networks.mmu import MMU
 from ..rollout import evaluate
 from ..types import Evaluation, Metrics
@@ -72,6 +77,9 @@ class Neuroevolution(eqx.Module):
     crossover_probability: float = 0.0  # chance that an offspring has a second parent, an elite
     cross_repeated: bool = eqx.field(static=True, default=False)
     """Cross every parent that selection drew before, so that no two offspring are clones."""
+    mating: tuple[AbstractCrossover, ...] = ()
+    """Operators that cross each offspring with another one, in turn, after mutation: Algorithm 5,
+    lines 15-23."""
     extinction: Extinction = Extinction(probability=0.0)
     elite_memory: int = eqx.field(static=True, default=1)
     """How many generations of an elite are averaged; from then on the newest counts one such
@@ -133,9 +141,24 @@ class Neuroevolution(eqx.Module):
         return cls.as_coded(env, network, **settings | overrides)
 
     @classmethod
+    def dmmu(cls, env: AbstractEnvironment, network: AbstractNetwork, **overrides) -> Self:
+        """Algorithm 5 with the settings of section 4.2.1: for teams on the server fleet. Where
+        agents share weights they do not change places."""
+        apart = isinstance(network, DMMU) or getattr(network, "sharing", None) == "nothing"
+        mating = (OnePointCrossover(), AgentCrossover()) if apart else (OnePointCrossover(),)
+        settings: dict[str, Any] = {"elite_fraction": 0.04, "test_episodes": 10}
+        settings |= {"mating": mating, "extinction": Extinction()}
+        return cls(env, network, **settings | overrides)
+
+    @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
         """Settings by name, for the command line."""
-        return {"as-written": cls, "as-coded": cls.as_coded, "ours": cls.ours}
+        return {
+            "as-written": cls,
+            "as-coded": cls.as_coded,
+            "ours": cls.ours,
+            "dmmu": cls.dmmu,
+        }
 
     @property
     def elites(self) -> int:
@@ -230,7 +253,9 @@ def breed(
     key: PRNGKeyArray,
 ) -> PyTree:
     """The next population: elites first, best to worst, then the offspring."""
-    select_key, cross_key, mutate_key, extinct_key, fresh_key = jax.random.split(key, 5)
+    select_key, cross_key, mutate_key, extinct_key, fresh_key, *mate_keys = jax.random.split(
+        key, 5 + len(algorithm.mating)
+    )
     n = algorithm.population_size - algorithm.elites
 
     # 6-7: Rank the population; select the first e as elites.
@@ -243,9 +268,22 @@ def breed(
     offspring = eqx.filter_vmap(lambda genome, key: algorithm.mutation(genome, key=key))(
         offspring, jax.random.split(mutate_key, n)
     )
+    for operator, mate_key in zip(algorithm.mating, mate_keys, strict=True):
+        offspring = mate(operator, offspring, key=mate_key)
     fresh = tree.take(algorithm.new_population(key=fresh_key), jnp.arange(n))
     offspring = algorithm.extinction(offspring, fresh, key=extinct_key)
     return tree.concat(elites, offspring)
+
+
+def mate(operator: AbstractCrossover, offspring: PyTree, *, key: PRNGKeyArray) -> PyTree:
+    """Cross each offspring with another one: Algorithm 5, lines 15-23."""
+    mate_key, cross_key = jax.random.split(key)
+    n = tree.size(offspring)
+    # Another one: 1 … n - 1 places further on.
+    mates = (jnp.arange(n) + jax.random.randint(mate_key, (n,), 1, max(n, 2))) % n
+    return eqx.filter_vmap(lambda a, b, key: operator(a, b, key=key))(
+        offspring, tree.take(offspring, mates), jax.random.split(cross_key, n)
+    )
 
 
 def recombine(

@@ -93,6 +93,12 @@ class AbstractSequenceTask(AbstractEnvironment):
         """What one answer earns, elementwise. `perfect`: every scored answer of this sequence
         was right, this one included."""
 
+    def lesson(self, sequence: Sequence) -> tuple[Float[Array, " time"], Float[Array, " time"]]:
+        """What training by gradient asks for: at each step the right answer in [-1, 1], and the
+        weight of a mistake, 0 for none. By default ±1 where the answer is scored."""
+        asked = sequence.scored & (sequence.targets != 0)
+        return jnp.sign(sequence.targets), asked.astype(jnp.float32)
+
     def reset(self, *, key: PRNGKeyArray) -> tuple[SequenceState, TimeStep]:
         sequence = self.sample(key=key)
         state = SequenceState(sequence, jnp.int32(0), jnp.bool_(True))

@@ -79,10 +79,15 @@ class SequenceRecall(AbstractSequenceTask):
         signal = jnp.where(instructing, directions[jnp.minimum(step, self.depth - 1)], 0.0)
         scored = jnp.zeros(self.max_steps, bool).at[junction].set(True)
         distance = distance.astype(jnp.float32) / (self.unit or self.max_corridor)
-        # The target holds along the corridor (gradient may learn from every step of it), but only
-        # the junction is scored.
+        # The target holds along the corridor (`lesson` asks at every step of it), but only the
+        # junction is scored.
         targets = jnp.where(instructing, 0.0, directions[corridor])
         return Sequence(jnp.stack([signal, distance], axis=1), targets, scored, junction[-1] + 1)
+
+    def lesson(self, sequence: Sequence) -> tuple[Float[Array, " time"], Float[Array, " time"]]:
+        """The next turn at every step of a corridor; undecided while directions are shown."""
+        played = jnp.arange(self.max_steps) < sequence.length
+        return sequence.targets, played.astype(jnp.float32)
 
     def reward(
         self,

@@ -37,6 +37,9 @@ class Shortened(AbstractSequenceTask):
         scored = sequence.scored & (jnp.arange(self.max_steps) < length)
         return Sequence(sequence.inputs, sequence.targets, scored, length)
 
+    def lesson(self, sequence):
+        return self.task.lesson(sequence)
+
     def reward(self, answer, target, scored, perfect):
         return self.task.reward(answer, target, scored, perfect)
 

@@ -6,6 +6,7 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import PRNGKeyArray, PyTree
 
 from .. import require, tree
@@ -41,3 +42,33 @@ class MaskedCrossover(AbstractCrossover):
         }[self.part]
         from_b = jax.random.bernoulli(key, self.probability, (parts,))
         return unravel(jnp.where(from_b[part], yours, mine))
+
+
+class OnePointCrossover(AbstractCrossover):
+    """Of each matrix, with chance `probability`, the child has the rows of `b` from a random one
+    on, and those of `a` above (Khadka 2019, Algorithm 5, line 19).
+
+    `taken="row"`: that one row alone, as the text around the box has it: "akin to exchanging a
+    randomly sampled neuron". A vector is a matrix of one column.
+    """
+
+    probability: float = 0.05  # of each matrix, in [0, 1]
+    taken: Literal["rest", "row"] = eqx.field(static=True, default="rest")
+
+    def __check_init__(self):
+        require.choice("taken", self.taken, ("rest", "row"))
+        require.within("probability", self.probability, 0, 1)
+
+    def __call__(self, a: PyTree, b: PyTree, *, key: PRNGKeyArray) -> PyTree:
+        gate_key, point_key = jax.random.split(key)
+        mine, unravel, layout = tree.ravel(a)
+        yours, _, _ = tree.ravel(b)
+        n = len(layout.sizes)
+        first = layout.row[np.searchsorted(layout.leaf, np.arange(n))]
+        rows = np.diff(np.append(first, layout.rows))
+        gate = jax.random.bernoulli(gate_key, self.probability, (n,))
+        point = first + jax.random.randint(point_key, (n,), 0, rows)
+        reached = layout.row >= point[layout.leaf]
+        if self.taken == "row":
+            reached = layout.row == point[layout.leaf]
+        return unravel(jnp.where(gate[layout.leaf] & reached, yours, mine))

@@ -107,3 +107,16 @@ class GaussianMutation(AbstractMutation):
     def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
         w, unravel, _ = tree.ravel(genome)
         return unravel(w + self.std * jax.random.normal(key, w.shape))
+
+
+class Mutations(AbstractMutation):
+    """Several, one behind the other."""
+
+    each: tuple[AbstractMutation, ...]
+
+    def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
+        for mutation, mutation_key in zip(
+            self.each, jax.random.split(key, len(self.each)), strict=True
+        ):
+            genome = mutation(genome, key=mutation_key)
+        return genome

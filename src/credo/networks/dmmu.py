@@ -9,6 +9,9 @@ of an episode, tanh outputs, agents in the order of their index, weights N(0, 1/
 N(0, 0.1²). Departures from that code, which are those of our MMU: the block input sees memory
 (equation 3.1) where the code fed it the last output, and the output has a bias.
 
+`cell` puts other networks in the place of the MMUs, the baselines "with shared memory" of section
+4.2.3: LSTMs whose cell is the memory of all (LSTMSM), or GRUs and Elman networks whose state is.
+
 Who takes part is read from the observation: its last number is 1 for an agent that acts, 0 for one
 that is busy, and -1 for one that is away, as `ServerFleet` has it. So it passes through everything
 that handles observations (rollouts, recordings, exported policies), any other network may be
@@ -23,11 +26,12 @@ from typing import Any, ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .. import require, tree
 from .base import INITIALIZERS, AbstractNetwork, AbstractPolicy
 from .mmu import MMU, MMUPolicy
+from .recurrent import GATES, Recurrent, RecurrentPolicy
 
 ORDERS = ("sequential", "simultaneous", "random")
 ACCESS = ("everyone", "present", "acting")
@@ -41,6 +45,8 @@ class DMMU(AbstractNetwork):
 
     team: ClassVar[bool] = True
 
+    cell: Literal["mmu", "lstm", "gru", "rnn"] = eqx.field(static=True, default="mmu")
+    """What an agent is. All but MMUs have exactly one unit for each memory cell."""
     hidden: int | tuple[int, ...] = eqx.field(static=True, default=30)
     """Hidden activations h: of every agent, or one number for each. An agent whose number is not
     that of the memory cells learns an encoder and a decoder; for the others both are the identity.
@@ -63,6 +69,13 @@ class DMMU(AbstractNetwork):
         for size in sizes:
             require.at_least("hidden", size, 1)
         require.at_least("memory", self.cells, 1)
+        require.choice("cell", self.cell, ("mmu", *GATES))
+        if self.cell != "mmu" and any(size != self.cells for size in sizes):
+            raise ValueError(
+                f"hidden is {self.hidden} and memory is {self.cells}: agents of cell "
+                f"{self.cell!r} have one unit for each memory cell; give one number for both, or "
+                "cell='mmu'"
+            )
         require.choice("order", self.order, ORDERS)
         require.choice("access", self.access, ACCESS)
         require.choice("initializer", self.initializer, INITIALIZERS)
@@ -95,7 +108,9 @@ class DMMU(AbstractNetwork):
         )
         return DMMUPolicy(tuple(scaled), self)
 
-    def _cell(self, hidden: int) -> MMU:
+    def _cell(self, hidden: int) -> AbstractNetwork:
+        if self.cell != "mmu":
+            return Recurrent(self.cell, hidden, "tanh", self.initializer)
         coder = "identity" if hidden == self.cells else "learned"
         return MMU(
             hidden,
@@ -111,7 +126,9 @@ class DMMU(AbstractNetwork):
 class DMMUCarry(eqx.Module):
     """What a team keeps between two steps."""
 
-    outputs: Float[Array, "agents act"]  # y, private: fed back to the agent's own gates
+    private: Float[Array, "agents size"]
+    """What an agent alone knows: an MMU's last output y, that it feeds back to its own gates; an
+    LSTM's h; nothing of other cells (size 0)."""
     memory: Float[Array, " cells"]  # m, shared
     key: Any = None  # of the orders to come, if they are random
 
@@ -120,13 +137,22 @@ class DMMUPolicy(AbstractPolicy):
     """One MMU per agent. A leaf is a matrix of one agent, so that operators on genomes see what is
     published."""
 
-    agents: tuple[MMUPolicy, ...]
+    agents: tuple[MMUPolicy | RecurrentPolicy, ...]
     config: DMMU = eqx.field(static=True)
 
+    @property
+    def members(self) -> tuple[PyTree, ...]:
+        """The weights of each agent."""
+        return self.agents
+
+    def with_members(self, members: tuple[PyTree, ...]) -> "DMMUPolicy":
+        """The team of these agents, as many as it has."""
+        return DMMUPolicy(members, self.config)
+
     def start(self, *, key: PRNGKeyArray) -> DMMUCarry:
-        y, m = self.agents[0].start()
-        outputs = jnp.zeros((len(self.agents), *y.shape))
-        return DMMUCarry(outputs, m, key if self.config.order == "random" else None)
+        own, m = _apart(self.agents[0].start())
+        private = jnp.zeros((len(self.agents), *own.shape))
+        return DMMUCarry(private, m, key if self.config.order == "random" else None)
 
     def __call__(
         self, obs: Float[Array, "agents obs"], carry: DMMUCarry
@@ -143,8 +169,7 @@ class DMMUPolicy(AbstractPolicy):
         """
         takes_part, inputs = self._split(obs)
         step = self._in_random_order if self.config.order == "random" else self._by_index
-        carry, writes = step(inputs, takes_part, carry)
-        return jnp.where(takes_part[:, None], carry.outputs, 0.0), carry, writes
+        return step(inputs, takes_part, carry)
 
     def without(self, agents: Sequence[int]) -> "DMMUPolicy":
         """The team that is left when those at these indices go, in the same order.
@@ -185,38 +210,49 @@ class DMMUPolicy(AbstractPolicy):
         # 1, 0 and -1, apart also under some noise.
         return obs[:, -1] > (-0.5 if access == "present" else 0.5), obs[:, :-1]
 
-    def _one(self, agent: MMUPolicy, x, y, m, takes_part: Bool[Array, ""]):
-        """Output and memory after one agent's access; as before if it takes no part."""
-        _, after = agent(x, (y, m))
-        return tree.where(takes_part, after, (y, m))
+    def _one(self, agent, x, own, m, takes_part: Bool[Array, ""]):
+        """Action, what is private, and memory after one agent's access; 0 and as before if it
+        takes no part."""
+        action, carry = agent(x, (own, m) if own.size else m)
+        after = (action, *_apart(carry))
+        return tree.where(takes_part, after, (jnp.zeros_like(action), own, m))
 
-    def _by_index(self, inputs, takes_part, carry: DMMUCarry) -> tuple[DMMUCarry, Array]:
+    def _by_index(self, inputs, takes_part, carry: DMMUCarry) -> tuple[Array, DMMUCarry, Array]:
         at_once = self.config.order == "simultaneous"
-        m, outputs, writes = carry.memory, [], []
+        m, actions, private, writes = carry.memory, [], [], []
         # Written out: a loop would copy the weights of every agent at every step.
         for i, agent in enumerate(self.agents):
             read = carry.memory if at_once else m
-            y, after = self._one(agent, inputs[i], carry.outputs[i], read, takes_part[i])
-            outputs.append(y)
+            action, own, after = self._one(agent, inputs[i], carry.private[i], read, takes_part[i])
+            actions.append(action)
+            private.append(own)
             writes.append(after - read)
             m = m + writes[i] if at_once else after
-        return DMMUCarry(jnp.stack(outputs), m, None), jnp.stack(writes)
+        carry = DMMUCarry(jnp.stack(private), m, None)
+        return jnp.stack(actions), carry, jnp.stack(writes)
 
-    def _in_random_order(self, inputs, takes_part, carry: DMMUCarry) -> tuple[DMMUCarry, Array]:
+    def _in_random_order(
+        self, inputs, takes_part, carry: DMMUCarry
+    ) -> tuple[Array, DMMUCarry, Array]:
         n = len(self.agents)
         key, order_key = jax.random.split(carry.key)
         order = jax.random.permutation(order_key, n)
         play = self._any_agent()
 
         def turn(k, loop):
-            outputs, m, writes = loop
+            actions, private, m, writes = loop
             i = order[k]
-            y, after = play(i, inputs[i], outputs[i], m, takes_part[i])
-            return outputs.at[i].set(y), after, writes.at[i].set(after - m)
+            action, own, after = play(i, inputs[i], private[i], m, takes_part[i])
+            written = writes.at[i].set(after - m)
+            return actions.at[i].set(action), private.at[i].set(own), after, written
 
-        start = (carry.outputs, carry.memory, jnp.zeros((n, *carry.memory.shape)))
-        outputs, memory, writes = jax.lax.fori_loop(0, n, turn, start)
-        return DMMUCarry(outputs, memory, key), writes
+        action, _, _ = jax.eval_shape(
+            self._one, self.agents[0], inputs[0], carry.private[0], carry.memory, takes_part[0]
+        )
+        nothing = (jnp.zeros((n, *action.shape)), jnp.zeros((n, *carry.memory.shape)))
+        start = (nothing[0], carry.private, carry.memory, nothing[1])
+        actions, private, memory, writes = jax.lax.fori_loop(0, n, turn, start)
+        return actions, DMMUCarry(private, memory, key), writes
 
     def _any_agent(self):
         """`_one` of an agent that is known by a traced index."""
@@ -226,3 +262,8 @@ class DMMUPolicy(AbstractPolicy):
         # Weights of different sizes are no rows of one array.
         branches = [functools.partial(self._one, agent) for agent in self.agents]
         return lambda i, *seen: jax.lax.switch(i, branches, *seen)
+
+
+def _apart(carry: PyTree) -> tuple[Array, Array]:
+    """What is private of an agent's carry, perhaps nothing, and what becomes the memory of all."""
+    return carry if isinstance(carry, tuple) else (jnp.zeros(0), carry)

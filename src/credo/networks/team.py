@@ -90,6 +90,18 @@ class TeamPolicy(AbstractPolicy):
 
         return self._each(one, obs, carry)
 
+    @property
+    def members(self) -> tuple[PyTree, ...] | None:
+        """The weights of each agent; None if some are shared."""
+        if self.config.sharing != "nothing":
+            return None
+        return tuple(zip(self.trunks, self.heads, strict=True))
+
+    def with_members(self, members: tuple[PyTree, ...]) -> "TeamPolicy":
+        """The team of these agents."""
+        trunks, heads = zip(*members, strict=True)
+        return TeamPolicy(trunks, heads, self.config, self.agents)
+
     def scaled(self, factor: Float[Array, ""] | float) -> "TeamPolicy":
         """With the output layers' weights times `factor`, where heads are perceptrons."""
         heads = (h.scaled(factor) if isinstance(h, MLPPolicy) else h for h in self.heads)
@@ -106,6 +118,39 @@ class TeamPolicy(AbstractPolicy):
         return eqx.filter_vmap(function, in_axes=axes, axis_size=self.agents)(
             *(part for part, _ in parts), *rest
         )
+
+
+class Centralized(AbstractNetwork):
+    """Config of one network that sees what all agents observe and acts for all of them: the
+    "centralized neural framework" of Khadka (2019), section 4.2.3.
+
+    Departure: every agent's observation is an input of its own; the author's code summed what the
+    agents were told, and had one busy flag for all.
+    """
+
+    team: ClassVar[bool] = True
+
+    network: AbstractNetwork = MLP(hidden=(300,))
+
+    def init(
+        self, obs_size: int, action_size: int, agents: int = 1, *, key: PRNGKeyArray
+    ) -> "CentralizedPolicy":
+        policy = self.network.init(agents * obs_size, agents * action_size, key=key)
+        return CentralizedPolicy(policy, agents)
+
+
+class CentralizedPolicy(AbstractPolicy):
+    policy: AbstractPolicy  # of everybody
+    agents: int = eqx.field(static=True)
+
+    def start(self, *, key: PRNGKeyArray) -> PyTree:
+        return self.policy.start(key=key)
+
+    def __call__(
+        self, obs: Float[Array, "agents obs"], carry: PyTree
+    ) -> tuple[Float[Array, "agents act"], PyTree]:
+        action, carry = self.policy(obs.reshape(-1), carry)
+        return action.reshape(self.agents, -1), carry
 
 
 class JointCritic(AbstractCritic):

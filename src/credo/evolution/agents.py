@@ -1,0 +1,71 @@
+"""Operators on teams whose agents have weights of their own: whole agents change places."""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+from jaxtyping import PRNGKeyArray, PyTree
+
+from .. import require, tree
+from .crossover import AbstractCrossover
+from .mutation import AbstractMutation
+
+
+class AgentCrossover(AbstractCrossover):
+    """Each agent of the team `a` is replaced, with chance `probability`, by one of `b`: a copy in
+    one direction (Khadka 2019, Algorithm 5, line 23).
+
+    `source`: the agent with the same index, or any of them (as coded). The genomes are policies of
+    teams whose agents have weights of their own.
+    """
+
+    probability: float = 0.05  # of each agent, in [0, 1]
+    source: Literal["same", "any"] = eqx.field(static=True, default="same")
+
+    def __check_init__(self):
+        require.choice("source", self.source, ("same", "any"))
+        require.within("probability", self.probability, 0, 1)
+
+    def __call__(self, a: PyTree, b: PyTree, *, key: PRNGKeyArray) -> PyTree:
+        chance_key, source_key = jax.random.split(key)
+        mine, yours = members(a), members(b)
+        n = len(mine)
+        if self.source == "any":
+            pool = tree.stack(*yours)
+            index = jax.random.randint(source_key, (n,), 0, n)
+            yours = tuple(tree.take(pool, index[i]) for i in range(n))
+        replaced = jax.random.bernoulli(chance_key, self.probability, (n,))
+        return a.with_members(tuple(tree.where(replaced[i], yours[i], mine[i]) for i in range(n)))
+
+
+class Homogenize(AbstractMutation):
+    """With chance `probability` a random agent of a team overwrites each other one with chance
+    `share`: what one has found, others have too. Of the author's code for DMMU; the dissertation
+    does not mention it. The genome is a policy whose agents have weights of their own."""
+
+    probability: float = 0.005  # per genome, in [0, 1]
+    share: float = 0.5  # of the other agents, in [0, 1]
+
+    def __check_init__(self):
+        require.within("probability", self.probability, 0, 1)
+        require.within("share", self.share, 0, 1)
+
+    def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
+        event_key, model_key, share_key = jax.random.split(key, 3)
+        mine = members(genome)
+        n = len(mine)
+        model = tree.take(tree.stack(*mine), jax.random.randint(model_key, (), 0, n))
+        event = jax.random.bernoulli(event_key, self.probability)
+        replaced = event & jax.random.bernoulli(share_key, self.share, (n,))
+        return genome.with_members(tuple(tree.where(replaced[i], model, mine[i]) for i in range(n)))
+
+
+def members(team: PyTree) -> tuple[PyTree, ...]:
+    """The genome of each agent; TypeError unless they have weights of their own."""
+    own = getattr(team, "members", None)
+    if own is None:
+        raise TypeError(
+            f"{type(team).__name__} has no agents with weights of their own: give DMMU or "
+            "Team(sharing='nothing'), or leave out the operators that exchange agents"
+        )
+    return own
