@@ -101,3 +101,20 @@ def test_ravel_acts_on_one_member_under_vmap():
     made = jax.vmap(scaled)(population)
     rows = np.array([[0.0], [1.0], [2.0]])
     np.testing.assert_array_equal(made["a"], np.arange(12.0).reshape(2, 3, 2) * rows)
+
+
+def test_a_packed_member_is_few_arrays_and_comes_back():
+    class Member(eqx.Module):
+        w: jax.Array
+        v: jax.Array
+        count: jax.Array
+        name: str = "member"
+
+    members = Member(
+        jnp.arange(12.0).reshape(2, 3, 2), jnp.arange(8.0).reshape(2, 4), jnp.array([[1], [2]])
+    )
+    pack, unpack = tree.packing(members)
+    rows = eqx.filter_vmap(pack)(members)
+    assert [x.shape for x in jax.tree.leaves(rows)] == [(2, 10), (2, 1)]
+    back = eqx.filter_vmap(unpack)(tree.take(rows, jnp.array([1, 0])))
+    assert eqx.tree_equal(back, tree.take(members, jnp.array([1, 0])))

@@ -140,6 +140,7 @@ def _play(
     worlds = world_keys(pop, episodes, common, key=world_key)
     reset_keys, step_keys = jnp.moveaxis(_each(jax.random.split)(worlds), 2, 0)
     states, first = _each(lambda key: env.reset(key=key))(reset_keys)
+    population = eqx.filter_vmap(lambda policy: policy.arranged())(population)
     carries = _start(population, jax.random.split(policy_key, lanes))
     active = jnp.broadcast_to(jnp.arange(episodes) < wanted, lanes)
     # Where policy or world said NaN the episode goes on, has a return of NaN, and is forgotten.

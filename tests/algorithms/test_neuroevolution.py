@@ -227,7 +227,7 @@ def test_a_fleet_learns_by_algorithm_5():
     team = Neuroevolution.dmmu(fleet, DMMU(hidden=3), population_size=30, episodes=20)
     team = dataclasses.replace(team, elite_fraction=0.1, test_episodes=100)
     state, key = team.init(key=KEY), jax.random.key(1)
-    for g in range(60):
+    for g in range(30):
         state, metrics = team.generation(state, key=jax.random.fold_in(key, g))
     assert float(metrics["champion_score"]) > 0.5
 

@@ -16,7 +16,9 @@ FRESH = {"w": jnp.ones((POP, 2)), "b": jnp.ones(POP)}
 def died(extinction):
     """`[generations, pop]`: who was replaced."""
     keys = jax.random.split(jax.random.key(0), GENERATIONS)
-    after = eqx.filter_jit(eqx.filter_vmap(lambda key: extinction(OLD, FRESH, key=key)))(keys)
+    after = eqx.filter_jit(eqx.filter_vmap(lambda key: extinction(OLD, lambda: FRESH, key=key)))(
+        keys
+    )
     w, b = np.asarray(after["w"]), np.asarray(after["b"])
     np.testing.assert_array_equal(w, np.stack([b, b], axis=2))  # whole members
     return b == 1.0
@@ -37,3 +39,20 @@ def test_events_come_with_their_probability_and_take_their_share():
 )
 def test_the_bounds(probability, magnitude, share):
     assert died(Extinction(probability, magnitude)).mean() == share
+
+
+def test_fresh_members_are_made_at_an_event_alone():
+    made = []
+
+    def fresh():
+        jax.debug.callback(lambda: made.append(1))
+        return FRESH
+
+    key = jax.random.key(0)
+    step = eqx.filter_jit(lambda chance: Extinction(chance)(OLD, fresh, key=key))
+    jax.block_until_ready(step(jnp.float32(0.0)))
+    jax.effects_barrier()
+    assert made == []
+    jax.block_until_ready(step(jnp.float32(1.0)))
+    jax.effects_barrier()
+    assert made == [1]

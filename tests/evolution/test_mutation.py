@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from credo import compilation
-from credo.evolution.mutation import GaussianMutation, MatrixMutation
+from credo.evolution.mutation import GaussianMutation, MatrixMutation, Mutations
 
 GENOMES = 300
 # Two matrices of one shape, so that shared noise would show, a vector, and what is no weight.
@@ -184,3 +184,28 @@ def test_gaussian_noise_has_its_std_everywhere():
 def test_impossible_mutations_are_refused(fields, told):
     with pytest.raises(ValueError, match=told):
         MatrixMutation(**fields)
+
+
+def test_one_entry_of_so_many_in_a_row_is_hit():
+    m = mutants(MatrixMutation(probability=1.0, one_in=7, strength=0.5))
+    moved = np.concatenate([m[name].reshape(GENOMES, -1) != 2.0 for name in "abv"], axis=1)
+    whole = moved[:, : 405 // 7 * 7].reshape(GENOMES, -1, 7)
+    assert (whole.sum(axis=2) == 1).all()
+    np.testing.assert_allclose(moved.mean(axis=0), 1 / 7, atol=5 * (0.13 / GENOMES) ** 0.5)
+    assert (m["a"] - 2.0)[m["a"] != 2.0].std() == pytest.approx(1.0, rel=0.05)
+
+
+def test_and_only_where_the_gate_is_open():
+    m = mutants(MatrixMutation(probability=0.5, one_in=2, vectors=False))
+    opened = np.stack([(m[name] != 2.0).any(axis=(1, 2)) for name in "ab"])
+    assert opened.mean() == pytest.approx(0.5, abs=0.1)
+    assert (opened[0] != opened[1]).any()
+    assert not (m["v"] != 2.0).any()
+    with pytest.raises(ValueError, match="one_in is 3 and up_to_fraction is set"):
+        MatrixMutation(one_in=3, up_to_fraction=True)
+
+
+def test_several_mutations_follow_each_other():
+    double = Mutations((GaussianMutation(3.0), GaussianMutation(4.0)))
+    m = mutants(double)
+    assert (m["a"] - 2.0).std() == pytest.approx(5.0, rel=0.03)

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
+from ..compilation import jit
 from ..environments.base import AbstractEnvironment
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.extinction import Extinction
@@ -59,7 +60,7 @@ class CCEA(eqx.Module):
     assignment: Literal["mean", "best"] = eqx.field(static=True, default="mean")
     selection: AbstractSelection = Tournament()
     mutation: AbstractMutation = MatrixMutation()
-    crossover: AbstractCrossover = MaskedCrossover()
+    crossover: AbstractCrossover | None = MaskedCrossover()  # as in Neuroevolution
     crossover_probability: float = 0.0
     cross_repeated: bool = eqx.field(static=True, default=False)
     mating: tuple[AbstractCrossover, ...] = ()  # as in Neuroevolution
@@ -110,7 +111,8 @@ class CCEA(eqx.Module):
         # 1: Initialize M populations of k neural network policies.
         keys = jax.random.split(key, self.agents)
         populations = eqx.filter_vmap(lambda key: self.new_population(key=key))(keys)
-        return CCEAState(populations, self.join(tree.take(populations, (slice(None), 0))))
+        first = jnp.zeros((self.agents, 1), jnp.int32)
+        return CCEAState(populations, tree.take(drafted(self, populations, first), 0))
 
     def generation(self, state: CCEAState, *, key: PRNGKeyArray) -> tuple[CCEAState, Metrics]:
         """Lines 4-21 of Algorithm 4, and the test of the champion team."""
@@ -118,19 +120,16 @@ class CCEA(eqx.Module):
 
         # 4-6: for i = 1 … kφ: select a network from each population randomly; they are team T_i.
         members = self.drawn(key=team_key)
-        every = jnp.arange(self.agents)[:, None]
-        teams = self.join(tree.take(state.populations, (every, members)))
+        teams = drafted(self, state.populations, members)
         # 7-8: run z independent simulations for team T_i; assign reward to each of its members.
         played = evaluate(self.env, teams, self.episodes, key=play_key)
         fitness = assigned(self, members, played.returns[self.signal])
         # 9-21: for each population: rank, keep the elites, select, mutate; now and then extinction.
         best = jnp.argmax(rankable(fitness), axis=1)
-        champion = self.join(tree.take(state.populations, (every[:, 0], best)))
-        populations = eqx.filter_vmap(
-            lambda population, fitness, key: breed(self, population, fitness, key=key)
-        )(state.populations, fitness, jax.random.split(breed_key, self.agents))
+        champion = drafted(self, state.populations, best[:, None])
+        populations = bred(self, state.populations, fitness, key=breed_key)
 
-        test = evaluate(self.env, tree.stack(champion), self.test_episodes, key=test_key)
+        test = evaluate(self.env, champion, self.test_episodes, key=test_key)
         returns = played.of(self.signal)
         metrics = {
             "fitness_max": jnp.max(rankable(jnp.mean(returns, axis=1))),
@@ -139,7 +138,7 @@ class CCEA(eqx.Module):
             "champion_score": jnp.mean(test.of(self.env.reported)),
             "frames": jnp.sum(played.steps),
         }
-        return CCEAState(populations, champion), metrics
+        return CCEAState(populations, tree.take(champion, 0)), metrics
 
     def drawn(self, *, key: PRNGKeyArray) -> Int[Array, "agents teams"]:
         """Who is in which team."""
@@ -149,14 +148,27 @@ class CCEA(eqx.Module):
         every = jnp.broadcast_to(jnp.arange(k), (agents, self.teams, k))
         return jax.random.permutation(key, every, axis=2, independent=True).reshape(agents, -1)
 
-    def join(self, members: PyTree) -> TeamPolicy:
-        """Policies `[agents, ...]` as one team, or `[agents, teams, ...]` as many."""
-        agents = self.agents
-        heads = tuple(tree.take(members, i) for i in range(agents))
-        config = Team(trunk=(), head=self.network, sharing="nothing")
-        return TeamPolicy(({},) * agents, heads, config, agents)
+
+@jit
+def drafted(ccea: CCEA, populations: PyTree, members: Int[Array, "agents teams"]) -> TeamPolicy:
+    """Teams `[teams, ...]` of these members of each population `[agents, k, ...]`."""
+    heads = tuple(tree.take(populations, (i, members[i])) for i in range(ccea.agents))
+    config = Team(trunk=(), head=ccea.network, sharing="nothing")
+    return TeamPolicy(({},) * ccea.agents, heads, config, ccea.agents)
 
 
+@jit
+def bred(
+    ccea: CCEA, populations: PyTree, fitness: Float[Array, "agents k"], *, key: PRNGKeyArray
+) -> PyTree:
+    """The next generation of each population."""
+    keys = jax.random.split(key, ccea.agents)
+    return eqx.filter_vmap(
+        lambda population, fitness, key: breed(ccea, population, fitness, key=key)
+    )(populations, fitness, keys)
+
+
+@jit
 def assigned(
     ccea: CCEA,
     members: Int[Array, "agents teams"],

@@ -73,7 +73,7 @@ class Neuroevolution(eqx.Module):
     test_episodes: int = eqx.field(static=True, default=50)  # fresh ones, for the champion
     selection: AbstractSelection = Tournament()
     mutation: AbstractMutation = MatrixMutation()
-    crossover: AbstractCrossover = MaskedCrossover()
+    crossover: AbstractCrossover | None = MaskedCrossover()  # with an elite; None: never
     crossover_probability: float = 0.0  # chance that an offspring has a second parent, an elite
     cross_repeated: bool = eqx.field(static=True, default=False)
     """Cross every parent that selection drew before, so that no two offspring are clones."""
@@ -147,7 +147,8 @@ class Neuroevolution(eqx.Module):
         apart = isinstance(network, DMMU) or getattr(network, "sharing", None) == "nothing"
         mating = (OnePointCrossover(), AgentCrossover()) if apart else (OnePointCrossover(),)
         settings: dict[str, Any] = {"elite_fraction": 0.04, "test_episodes": 10}
-        settings |= {"mating": mating, "extinction": Extinction()}
+        settings["mutation"] = MatrixMutation(one_in=10)  # a fleet has 100,000 weights
+        settings |= {"crossover": None, "mating": mating, "extinction": Extinction()}
         return cls(env, network, **settings | overrides)
 
     @classmethod
@@ -257,37 +258,41 @@ def breed(
         key, 5 + len(algorithm.mating)
     )
     n = algorithm.population_size - algorithm.elites
+    pack, unpack = tree.packing(population)
+    rows = eqx.filter_vmap(pack)(population)
+
+    def each(operator, *parents: PyTree, key: PRNGKeyArray) -> PyTree:
+        """What an operator makes of each of the parents."""
+        return eqx.filter_vmap(
+            lambda key, *parents: pack(operator(*map(unpack, parents), key=key))
+        )(jax.random.split(key, n), *parents)
 
     # 6-7: Rank the population; select the first e as elites.
-    elites = tree.take(population, ranking(fitness)[: algorithm.elites])
+    elites = tree.take(rows, ranking(fitness)[: algorithm.elites])
     # 8: Select (k - e) networks, to form set S.
     selected = algorithm.selection(fitness, n, key=select_key)
-    offspring = tree.take(population, selected)
-    offspring = recombine(algorithm, elites, offspring, repeated(selected), key=cross_key)
+    offspring = tree.take(rows, selected)
+    offspring = recombine(algorithm, each, elites, offspring, repeated(selected), key=cross_key)
     # 9-12: for each network in S, mutate its matrices.
-    offspring = eqx.filter_vmap(lambda genome, key: algorithm.mutation(genome, key=key))(
-        offspring, jax.random.split(mutate_key, n)
-    )
+    offspring = each(algorithm.mutation, offspring, key=mutate_key)
+    # Algorithm 5, 15-23: cross it with another one of S.
     for operator, mate_key in zip(algorithm.mating, mate_keys, strict=True):
-        offspring = mate(operator, offspring, key=mate_key)
-    fresh = tree.take(algorithm.new_population(key=fresh_key), jnp.arange(n))
+        next_key, cross_key = jax.random.split(mate_key)
+        further = jax.random.randint(next_key, (n,), 1, max(n, 2))
+        mates = tree.take(offspring, (jnp.arange(n) + further) % n)
+        offspring = each(operator, offspring, mates, key=cross_key)
+
+    def fresh():
+        made = algorithm.new_population(key=fresh_key)
+        return eqx.filter_vmap(pack)(tree.take(made, jnp.arange(n)))
+
     offspring = algorithm.extinction(offspring, fresh, key=extinct_key)
-    return tree.concat(elites, offspring)
-
-
-def mate(operator: AbstractCrossover, offspring: PyTree, *, key: PRNGKeyArray) -> PyTree:
-    """Cross each offspring with another one: Algorithm 5, lines 15-23."""
-    mate_key, cross_key = jax.random.split(key)
-    n = tree.size(offspring)
-    # Another one: 1 … n - 1 places further on.
-    mates = (jnp.arange(n) + jax.random.randint(mate_key, (n,), 1, max(n, 2))) % n
-    return eqx.filter_vmap(lambda a, b, key: operator(a, b, key=key))(
-        offspring, tree.take(offspring, mates), jax.random.split(cross_key, n)
-    )
+    return eqx.filter_vmap(unpack)(tree.concat(elites, offspring))
 
 
 def recombine(
     algorithm: Neuroevolution,
+    each: Callable[..., PyTree],
     elites: PyTree,
     offspring: PyTree,
     repeat: Bool[Array, " n"],
@@ -297,12 +302,10 @@ def recombine(
     """Give some offspring a random elite as the first parent."""
     chance_key, mate_key, cross_key = jax.random.split(key, 3)
     n = tree.size(offspring)
-    if algorithm.elites == 0:
+    if algorithm.elites == 0 or algorithm.crossover is None:
         return offspring
     mates = tree.take(elites, jax.random.randint(mate_key, (n,), 0, algorithm.elites))
-    children = eqx.filter_vmap(lambda a, b, key: algorithm.crossover(a, b, key=key))(
-        mates, offspring, jax.random.split(cross_key, n)
-    )
+    children = each(algorithm.crossover, mates, offspring, key=cross_key)
     crossed = jax.random.bernoulli(chance_key, algorithm.crossover_probability, (n,))
     crossed = crossed | (repeat & algorithm.cross_repeated)
     return eqx.filter_vmap(tree.where)(crossed, children, offspring)

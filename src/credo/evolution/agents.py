@@ -4,7 +4,9 @@ from typing import Literal
 
 import equinox as eqx
 import jax
-from jaxtyping import PRNGKeyArray, PyTree
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .. import require, tree
 from .crossover import AbstractCrossover
@@ -28,14 +30,13 @@ class AgentCrossover(AbstractCrossover):
 
     def __call__(self, a: PyTree, b: PyTree, *, key: PRNGKeyArray) -> PyTree:
         chance_key, source_key = jax.random.split(key)
-        mine, yours = members(a), members(b)
-        n = len(mine)
+        n = len(members(a))
         if self.source == "any":
-            pool = tree.stack(*yours)
+            pool = tree.stack(*members(b))
             index = jax.random.randint(source_key, (n,), 0, n)
-            yours = tuple(tree.take(pool, index[i]) for i in range(n))
+            b = b.with_members(tuple(tree.take(pool, index[i]) for i in range(n)))
         replaced = jax.random.bernoulli(chance_key, self.probability, (n,))
-        return a.with_members(tuple(tree.where(replaced[i], yours[i], mine[i]) for i in range(n)))
+        return exchanged(a, b, replaced)
 
 
 class Homogenize(AbstractMutation):
@@ -69,3 +70,17 @@ def members(team: PyTree) -> tuple[PyTree, ...]:
             "Team(sharing='nothing'), or leave out the operators that exchange agents"
         )
     return own
+
+
+def exchanged(team: PyTree, other: PyTree, replaced: Bool[Array, " agents"]) -> PyTree:
+    """The team with some of its agents replaced by those of the other in the same places."""
+    numbered = team.with_members(
+        tuple(
+            jax.tree.map(lambda x, i=i: np.full(x.shape, i) if eqx.is_inexact_array(x) else x, one)
+            for i, one in enumerate(members(team))
+        )
+    )
+    mine, unravel, _ = tree.ravel(team)
+    yours, _, _ = tree.ravel(other)
+    numbers = [x.reshape(-1) for x in jax.tree.leaves(numbered) if isinstance(x, np.ndarray)]
+    return unravel(jnp.where(replaced[np.concatenate(numbers)], yours, mine))

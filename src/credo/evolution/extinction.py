@@ -1,5 +1,7 @@
 """Extinction: now and then most of a population dies out and is seeded anew."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 from jaxtyping import PRNGKeyArray, PyTree
@@ -18,9 +20,17 @@ class Extinction(eqx.Module):
         require.within("probability", self.probability, 0, 1)
         require.within("magnitude", self.magnitude, 0, 1)
 
-    def __call__(self, population: PyTree, fresh: PyTree, *, key: PRNGKeyArray) -> PyTree:
-        """`population` and `fresh` `[pop, ...]`; spare the elites by not passing them."""
+    def __call__(
+        self, population: PyTree, fresh: Callable[[], PyTree], *, key: PRNGKeyArray
+    ) -> PyTree:
+        """**Arguments:** `population` `[pop, ...]`; spare the elites by not passing them. `fresh`
+        makes another one like it, and is asked when there is an event alone."""
         event_key, member_key = jax.random.split(key)
         event = jax.random.bernoulli(event_key, self.probability)
-        dies = event & jax.random.bernoulli(member_key, self.magnitude, (tree.size(population),))
-        return eqx.filter_vmap(tree.where)(dies, fresh, population)
+        dies = jax.random.bernoulli(member_key, self.magnitude, (tree.size(population),))
+        arrays, rest = eqx.partition(population, eqx.is_array)
+
+        def seeded():
+            return eqx.filter(eqx.filter_vmap(tree.where)(dies, fresh(), population), eqx.is_array)
+
+        return eqx.combine(jax.lax.cond(event, seeded, lambda: arrays), rest)

@@ -34,6 +34,9 @@ class MatrixMutation(AbstractMutation):
     fraction: float = 0.1  # share of a matrix's entries that is hit, in [0, 1]
     up_to_fraction: bool = eqx.field(static=True, default=False)
     """Draw the share anew for each matrix, uniformly up to `fraction` and at least one entry."""
+    one_in: int | None = eqx.field(static=True, default=None)
+    """Instead of `fraction`: of so many entries in a row one is hit, drawn at random. As many hits,
+    for a fraction of the random numbers; for genomes of very many weights."""
     vectors: bool = eqx.field(static=True, default=True)  # hit biases and start memory too
     strength: float = 0.1  # std of the noise, relative to the weight
     floor: float = 0.0  # std of further noise, absolute, so that small weights can move
@@ -49,16 +52,40 @@ class MatrixMutation(AbstractMutation):
         for name in ("strength", "floor", "super_strength", "reset_std", "limit"):
             require.at_least(name, getattr(self, name), 0)
         require.choice("gate", self.gate, ("matrix", "genome"))
+        if self.one_in is not None:
+            require.at_least("one_in", self.one_in, 1)
+            if self.up_to_fraction:
+                raise ValueError(f"one_in is {self.one_in} and up_to_fraction is set: give one")
 
     def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
         gate_key, hit_key, move_key = jax.random.split(key, 3)
         w, unravel, layout = tree.ravel(genome)
         gates = jax.random.bernoulli(gate_key, self.probability, layout.sizes.shape)
         gate = gates[0] if self.gate == "genome" else gates[layout.leaf]
-        hit = gate & self.hits(layout, key=hit_key)
         if not self.vectors:
-            hit = hit & layout.matrix
+            gate = gate & layout.matrix
+        if self.one_in is not None:
+            return unravel(self.one_of_each(w, gate, hit_key, move_key))
+        hit = gate & self.hits(layout, key=hit_key)
         return unravel(jnp.where(hit, self.moved(w, key=move_key), w))
+
+    def one_of_each(
+        self,
+        w: Float[Array, " entries"],
+        gate: Bool[Array, "..."],
+        hit_key: PRNGKeyArray,
+        move_key: PRNGKeyArray,
+    ) -> Float[Array, " entries"]:
+        """The weights when of every `one_in` in a row one is hit, where its gate is open."""
+        size, width = w.shape[0], self.one_in or 1
+        first = jnp.arange(0, size, width)
+        index = first + jax.random.randint(hit_key, first.shape, 0, width)
+        seen = jnp.minimum(index, size - 1)
+        old = w[seen]
+        opened = jnp.broadcast_to(gate, w.shape)[seen]
+        new = jnp.where(opened, self.moved(old, key=move_key), old)
+        # Of a last row that is shorter perhaps none is hit: each entry has the same chance.
+        return w.at[index].set(new, mode="drop", unique_indices=True)
 
     def hits(self, layout: tree.Layout, *, key: PRNGKeyArray) -> Bool[Array, " entries"]:
         """Which entries a mutation hits in the matrices whose gate is open."""

@@ -53,6 +53,10 @@ class AbstractPolicy(eqx.Module):
     ) -> tuple[Float[Array, "act *batch"], PyTree]:
         """An action in [-1, 1] and the next carry."""
 
+    def arranged(self) -> "AbstractPolicy":
+        """The same policy, laid out for many steps: rollouts ask for it once and act with it."""
+        return self
+
 
 class AbstractNetwork(eqx.Module):
     """The config of a policy."""

@@ -99,14 +99,15 @@ class DMMU(AbstractNetwork):
         inputs = obs_size - int(self.access != "everyone")
         require.at_least("inputs beside the status", inputs, 1)
         keys = jax.random.split(key, agents)
-        made = (
-            self._cell(size).init(inputs, action_size, key=key)
-            for size, key in zip(sizes, keys, strict=True)
-        )
-        scaled = (
-            jax.tree.map(lambda w: w if w.ndim == 2 else self.bias_std * w, agent) for agent in made
-        )
-        return DMMUPolicy(tuple(scaled), self)
+
+        def agent(size, key):
+            fresh = self._cell(size).init(inputs, action_size, key=key)
+            return jax.tree.map(lambda w: w if w.ndim == 2 else self.bias_std * w, fresh)
+
+        if len(set(sizes)) > 1:
+            return DMMUPolicy(tuple(map(agent, sizes, keys)), self)
+        alike = eqx.filter_vmap(lambda key: agent(sizes[0], key))(keys)  # one program for all
+        return DMMUPolicy(tuple(tree.take(alike, i) for i in range(agents)), self)
 
     def _cell(self, hidden: int) -> AbstractNetwork:
         if self.cell != "mmu":
@@ -148,6 +149,9 @@ class DMMUPolicy(AbstractPolicy):
     def with_members(self, members: tuple[PyTree, ...]) -> "DMMUPolicy":
         """The team of these agents, as many as it has."""
         return DMMUPolicy(members, self.config)
+
+    def arranged(self) -> "DMMUPolicy":
+        return self.with_members(tuple(agent.arranged() for agent in self.agents))
 
     def start(self, *, key: PRNGKeyArray) -> DMMUCarry:
         own, m = _apart(self.agents[0].start())

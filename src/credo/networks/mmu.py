@@ -15,7 +15,8 @@ the text, which leaves φ and θ open and calls encoder and decoder the identity
 - The block input sees memory (equation 3.1); the author's code fed it the last output.
 """
 
-from typing import ClassVar, Literal
+import dataclasses
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -47,8 +48,10 @@ class MMU(AbstractNetwork):
     output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
     start_memory: Literal["learned", "zero"] = eqx.field(static=True, default="learned")
     initializer: str = eqx.field(static=True, default="normal")  # normal, fan_in or kaiming
-    start_weights: Literal["drawn", "saturated"] = eqx.field(static=True, default="drawn")
-    """`saturated`: at first every gate is open or shut by the input alone, and memory is read but
+    start_weights: Literal["drawn", "saturated", "closed"] = eqx.field(static=True, default="drawn")
+    """`closed`: the write gate's bias is lowered by 4, so that memory hardly moves before a gate
+    has learned to open, and gradients reach back through it (compare an LSTM's forget bias).
+    `saturated`: at first every gate is open or shut by the input alone, and memory is read but
     not written at distractors. Input weights are drawn 30 times as large, output weights 75 times
     and clipped to ±40, output feedback 0.1 times; the write gate's bias is lowered and the read
     gate's raised by 20."""
@@ -62,7 +65,7 @@ class MMU(AbstractNetwork):
         for name in ("block_activation", "decoder_activation", "encoder_activation"):
             require.choice(name, getattr(self, name), ACTIVATIONS)
         require.choice("output_activation", self.output_activation, ("sigmoid", "tanh"))
-        require.choice("start_weights", self.start_weights, ("drawn", "saturated"))
+        require.choice("start_weights", self.start_weights, ("drawn", "saturated", "closed"))
         require.choice("start_memory", self.start_memory, ("learned", "zero"))
         require.choice("initializer", self.initializer, INITIALIZERS)
         if "identity" in (self.encoder, self.decoder) and self.cells != self.hidden:
@@ -89,7 +92,9 @@ class MMU(AbstractNetwork):
             shapes |= {"Z_f": (m, h), "b_f": (m,)}
         if self.start_memory == "learned":
             shapes |= {"m_0": (m,)}
-        weights = draw(shapes, self.initializer, key=key)
+        weights: dict[str, Any] = draw(shapes, self.initializer, key=key)
+        if self.start_weights == "closed":
+            weights["b_w"] = weights["b_w"] - 4.0
         if self.start_weights == "saturated":
             scale = {"K": 30.0, "R": 0.1}
             weights = {name: scale.get(name[0], 1.0) * w for name, w in weights.items()}
@@ -126,6 +131,21 @@ class MMUPolicy(AbstractPolicy):
     Z_f: Float[Array, "m h"] | None = None
     b_f: Float[Array, " m"] | None = None
     m_0: Float[Array, " m"] | None = None
+    joined: tuple[Array, Array] | None = None
+    """All gates' and the block input's weights on (x, y, m) as one matrix `[in, out]`, and their
+    biases. Of `arranged` policies alone: else the genome would hold everything twice."""
+
+    def arranged(self) -> "MMUPolicy":
+        no_feedback = jnp.zeros_like(self.R_i)
+        rows = (
+            (self.K_i, self.R_i, self.N_i, self.b_i),
+            (self.K_p, no_feedback, self.N_p, self.b_p),
+            (self.K_r, self.R_r, self.N_r, self.b_r),
+            (self.K_w, self.R_w, self.N_w, self.b_w),
+        )
+        weights = jnp.concatenate([jnp.concatenate(row[:3], axis=1) for row in rows])
+        joined = (weights.T, jnp.concatenate([row[3] for row in rows]))
+        return dataclasses.replace(self, joined=joined)
 
     def start(self, *, key: PRNGKeyArray | None = None):
         y = jnp.zeros_like(self.b_y)
@@ -143,12 +163,10 @@ class MMUPolicy(AbstractPolicy):
                 c.output_activation,
             )
         )
-        i = σ(matvec(self.K_i, x) + matvec(self.R_i, y) + matvec(self.N_i, m) + self.b_i)
-        p = φ(matvec(self.K_p, x) + matvec(self.N_p, m) + self.b_p)  # (3.1)
-        r = σ(matvec(self.K_r, x) + matvec(self.R_r, y) + matvec(self.N_r, m) + self.b_r)
+        at_i, at_p, at_r, at_w = self._inputs(x, y, m)
+        i, p, r, w = σ(at_i), φ(at_p), σ(at_r), σ(at_w)  # (3.1), gates
         d = θ_d(_affine(self.N_d, m, self.b_d))  # (3.2)
         h = r * d + p * i  # (3.3)
-        w = σ(matvec(self.K_w, x) + matvec(self.R_w, y) + matvec(self.N_w, m) + self.b_w)
         f = θ_f(_affine(self.Z_f, h, self.b_f))
         if c.alpha == 0.0:
             m = m + w * f
@@ -156,6 +174,19 @@ class MMUPolicy(AbstractPolicy):
             m = (1.0 - c.alpha) * (m + w * f) + c.alpha * (w * f + (1.0 - w) * m)  # (3.4)
         y = φ_y(matvec(self.Z_y, h) + self.b_y)  # (3.5)
         return to_action(y, c.output_activation), (y, m)
+
+    def _inputs(self, x, y, m):
+        """What the input gate, the block input, the read gate and the write gate are fed."""
+        if self.joined is not None:
+            h, weights = self.config.hidden, self.joined[0]
+            fed = jnp.concatenate([x, y, m]) @ weights + self.joined[1]
+            return jnp.split(fed, (h, 2 * h, 3 * h))
+        return (
+            matvec(self.K_i, x) + matvec(self.R_i, y) + matvec(self.N_i, m) + self.b_i,
+            matvec(self.K_p, x) + matvec(self.N_p, m) + self.b_p,
+            matvec(self.K_r, x) + matvec(self.R_r, y) + matvec(self.N_r, m) + self.b_r,
+            matvec(self.K_w, x) + matvec(self.R_w, y) + matvec(self.N_w, m) + self.b_w,
+        )
 
 
 def _affine(w: Array | None, x: Array, b: Array | None) -> Array:

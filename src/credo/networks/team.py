@@ -59,9 +59,11 @@ class Team(AbstractNetwork):
                 draw_layers(sizes, self.initializer, key=key)
                 for key in jax.random.split(trunk_key, trunks)
             ),
-            tuple(
-                self.head.init(sizes[-1], action_size, key=key)
-                for key in jax.random.split(head_key, heads)
+            _each_row(
+                eqx.filter_vmap(lambda key: self.head.init(sizes[-1], action_size, key=key))(
+                    jax.random.split(head_key, heads)
+                ),
+                heads,
             ),
             self,
             agents,
@@ -76,6 +78,13 @@ class TeamPolicy(AbstractPolicy):
     heads: tuple[AbstractPolicy, ...]
     config: Team = eqx.field(static=True)
     agents: int = eqx.field(static=True)
+    rows: tuple[PyTree, PyTree] | None = None
+    """Trunks and heads as `_each` takes them; of `arranged` policies alone."""
+
+    def arranged(self) -> "TeamPolicy":
+        heads = tuple(head.arranged() for head in self.heads)
+        rows = (_rows(self.trunks), _rows(heads))
+        return TeamPolicy(self.trunks, self.heads, self.config, self.agents, rows)
 
     def start(self, *, key: PRNGKeyArray) -> PyTree:
         keys = jax.random.split(key, self.agents)
@@ -110,14 +119,22 @@ class TeamPolicy(AbstractPolicy):
     def _each(self, function, *rest: PyTree) -> PyTree:
         """`function(trunk, head, *rest)` for every agent. What is shared has no axis of agents, so
         that a layer is one matrix product for all."""
-        parts = [
-            (one_of[0], None) if len(one_of) == 1 else (tree.stack(*one_of), eqx.if_array(0))
-            for one_of in (self.trunks, self.heads)
-        ]
-        axes = (*(axis for _, axis in parts), *(0 for _ in rest))
-        return eqx.filter_vmap(function, in_axes=axes, axis_size=self.agents)(
-            *(part for part, _ in parts), *rest
+        parts = self.rows or (_rows(self.trunks), _rows(self.heads))
+        axes = (
+            None if len(one_of) == 1 else eqx.if_array(0) for one_of in (self.trunks, self.heads)
         )
+        axes = (*axes, *(0 for _ in rest))
+        return eqx.filter_vmap(function, in_axes=axes, axis_size=self.agents)(*parts, *rest)
+
+
+def _each_row(rows: PyTree, n: int) -> tuple[PyTree, ...]:
+    """The other way round, and of one as well."""
+    return tuple(tree.take(rows, i) for i in range(n))
+
+
+def _rows(one_of: tuple[PyTree, ...]) -> PyTree:
+    """What all agents share, or the parts of each with an axis of agents."""
+    return one_of[0] if len(one_of) == 1 else tree.stack(*one_of)
 
 
 class Centralized(AbstractNetwork):
@@ -142,6 +159,9 @@ class Centralized(AbstractNetwork):
 class CentralizedPolicy(AbstractPolicy):
     policy: AbstractPolicy  # of everybody
     agents: int = eqx.field(static=True)
+
+    def arranged(self) -> "CentralizedPolicy":
+        return CentralizedPolicy(self.policy.arranged(), self.agents)
 
     def start(self, *, key: PRNGKeyArray) -> PyTree:
         return self.policy.start(key=key)
