@@ -66,6 +66,7 @@ _EXPORTS = {
     "ddpg": "learners.td3",
     "SAC": "learners.sac",
     "PPO": "algorithms.ppo",
+    "BPTT": "algorithms.bptt",
     "AbstractCritic": "networks.mlp",
     "AbstractCriticNetwork": "networks.mlp",
     "Critic": "networks.mlp",

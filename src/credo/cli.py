@@ -68,6 +68,12 @@ ALGORITHMS["ccea"] = Entry(
     None,
     "cooperative coevolution, a population per agent (Algorithm 4)",
 )
+ALGORITHMS["bptt"] = Entry(
+    "credo.algorithms.bptt:BPTT",
+    "as-written",
+    "mmu",
+    "one network by gradient through time, on labelled sequences (3.4)",
+)
 ALGORITHMS["ppo"] = Entry(
     "credo.algorithms.ppo:PPO", "ppo", None, "proximal policy optimization, on fresh frames alone"
 )
@@ -116,6 +122,7 @@ NETWORKS = {
 }
 EXPERIMENTS = {
     "fig-3.4a": "success by depth, sequence classification",
+    "fig-3.4b": "MMU and recurrent networks by evolution, classification",
     "fig-3.5a": "generalization to 0..101 distractors",
     "fig-3.5b": "generalization to depth 101",
     "table-3.1": "final memory of the 8 permutations of depth 3",
@@ -124,8 +131,19 @@ EXPERIMENTS = {
     "fig-3.7": "write heat map, depth 21",
     "alg-3.3": "the pseudo-algorithm a champion runs",
     "fig-3.9a": "success by depth, sequence recall",
+    "fig-3.9b": "MMU and recurrent networks by evolution, recall",
     "fig-3.10": "recall in corridors of 1..101 steps",
+    "fig-3.11": "an MMU by gradient, classification, beside evolution",
+    "fig-3.12": "an MMU by gradient, recall, beside evolution",
+    "fig-3.13": "recall by gradient in corridors of 1..101 steps",
+    "beyond-3": "four networks by evolution and gradient, depth 10^6",
     "ablation-3.4a": "our settings less one ingredient, 21-deep",
+    "fig-4.2": "T-maze, Converge, beside a static robot",
+    "fig-4.3": "T-maze, Spread, beside a static robot",
+    "fig-4.4": "T-maze, Spread, teams of learning robots",
+    "fig-4.7": "server fleet, DMMU and baselines",
+    "fig-4.8": "writes to the shared memory, by server",
+    "table-4.1": "case study of two servers, six configurations",
     "check-td3": "TD3 alone, against its authors",
     "check-learners": "DDPG, SAC and TD3 alone, on cheap tasks",
     "fig-5.2": "standard and hard inverted double pendulum",
@@ -305,7 +323,7 @@ tasks:      {", ".join(TASKS)}
             or package.module:Class
 networks:   {", ".join(NETWORKS)} (default: the algorithm's own)
             each agent of a team has a network of its own, unless it is one for teams
-presets:    {", ".join(PRESETS)} (default: as-written), of neuroevolution
+presets:    {", ".join(PRESETS)} (default: as-written), of neuroevolution and bptt
             ours, of erl: for a reward that comes late
 
 credo train ALGORITHM TASK --help lists every flag with its unit and default."""
@@ -632,14 +650,17 @@ def _positional(argv: list[str], usage: str, what: str) -> tuple[str, list[str]]
 
 
 def _summary(run: Any) -> str:
+    from .runs.progress import best_of
+
     metrics = run.metrics
     settings = run.config["algorithm"]
     score, episodes = f"{metrics['champion_score'][-1]:.4g}", settings.get("test_episodes")
     if settings.get("test_every", 1) > 1:  # the champion of today need not be the one tested
         score += " at the last test"
+    best, value = best_of({name: column[-1] for name, column in metrics.items()})
     return (
-        f"{run.path}: generation {int(metrics['generation'][-1])}, best fitness "
-        f"{metrics['fitness_max'][-1]:.4g}, champion score {score}"
+        f"{run.path}: generation {int(metrics['generation'][-1])}, {best} "
+        f"{value:.4g}, champion score {score}"
         + (f" on {episodes} fresh episodes" if episodes is not None else "")
     )
 

@@ -21,7 +21,6 @@ from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
 
-
 CLASSIFICATION = SequenceClassification(depth=3, min_gap=1, max_gap=4)
 RECALL = SequenceRecall(depth=2, min_corridor=1, max_corridor=4)
 TASKS = {"classification": CLASSIFICATION, "recall": RECALL}
@@ -56,7 +55,9 @@ def test_answers_are_those_of_the_policy_alone(checkpoint):
     batch = drawn(CLASSIFICATION)
     policy = network(CLASSIFICATION)
     np.testing.assert_allclose(
-        respond(policy, batch.inputs, checkpoint), answers_one_by_one(policy, batch.inputs), atol=1e-6
+        respond(policy, batch.inputs, checkpoint),
+        answers_one_by_one(policy, batch.inputs),
+        atol=1e-6,
     )
 
 
@@ -78,7 +79,9 @@ def test_the_gradient_is_that_of_a_plain_scan_and_of_finite_differences(name):
 
         def moved(by, leaf=leaf):
             where = (0,) * getattr(policy, leaf).ndim
-            there = eqx.tree_at(lambda p: getattr(p, leaf), policy, getattr(policy, leaf).at[where].add(by))
+            there = eqx.tree_at(
+                lambda p: getattr(p, leaf), policy, getattr(policy, leaf).at[where].add(by)
+            )
             return float(loss_of(there, bptt, batch))
 
         slope = (moved(step) - moved(-step)) / (2 * step)
@@ -86,7 +89,9 @@ def test_the_gradient_is_that_of_a_plain_scan_and_of_finite_differences(name):
     assert sum(float(jnp.sum(jnp.abs(x))) for x in jax.tree.leaves(ours)) > 0.01
 
 
-@pytest.mark.parametrize("net", [MMU(hidden=3), Recurrent("lstm", 3), Recurrent("gru", 3), MLP((3,))])
+@pytest.mark.parametrize(
+    "net", [MMU(hidden=3), Recurrent("lstm", 3), Recurrent("gru", 3), MLP((3,))]
+)
 def test_segments_computed_twice_change_nothing(net):
     batch, policy = drawn(RECALL), network(RECALL, net)
     kept, segments = (
@@ -104,7 +109,9 @@ def test_segments_need_less_memory():
         bptt = BPTT(task, net, checkpoint=checkpoint)
         weights, static = eqx.partition(policy, eqx.is_array)
         slope = jax.jit(
-            jax.grad(lambda w, bptt=bptt, static=static: loss_of(eqx.combine(w, static), bptt, batch))
+            jax.grad(
+                lambda w, bptt=bptt, static=static: loss_of(eqx.combine(w, static), bptt, batch)
+            )
         )
         needed[checkpoint] = slope.lower(weights).compile().memory_analysis().temp_size_in_bytes
     assert needed[25] < 0.5 * needed[1]
@@ -186,8 +193,8 @@ def test_the_loss_is_half_the_squared_distance_of_outputs_in_0_to_1(answer):
 
 
 def test_l2_is_part_of_what_adam_normalises():
-    """Two steps against torch's definition, g + λw into Adam, written out."""
-    bptt = dataclasses.replace(SMALL, l2=0.3, learning_rate=0.02)
+    """Two steps against torch's definition, g + λw into Adam, written out; and the rate falls."""
+    bptt = dataclasses.replace(SMALL, l2=0.3, learning_rate=0.02, decay=0.5)
     state = bptt.init(key=KEY)
     weights, rest = eqx.partition(state.champion, eqx.is_array)
     flat, unravel = jax.flatten_util.ravel_pytree(weights)
@@ -199,13 +206,14 @@ def test_l2_is_part_of_what_adam_normalises():
         g = np.asarray(jax.flatten_util.ravel_pytree(gradient(policy, bptt, batch))[0], np.float64)
         g = g + 0.3 * w
         m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
-        w = w - 0.02 * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-8)
+        w = w - 0.02 * 0.5 ** (t - 1) * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-8)
     after, losses, frames = descend(bptt, state, key=jax.random.key(3))
     found, _ = jax.flatten_util.ravel_pytree(eqx.filter(after.champion, eqx.is_array))
     np.testing.assert_allclose(found, w, atol=2e-5)
     lengths = [int(jnp.sum(bptt.batch(state.examples, key=key).length)) for key in keys]
     assert frames.tolist() == lengths
     assert losses.shape == (2,)
+    assert int(after.done) == 2
 
 
 def test_a_training_set_is_drawn_once_and_batches_from_it_without_repeats():
@@ -259,6 +267,12 @@ def test_presets_are_what_was_printed_and_what_was_coded():
     assert not np.any(policy.b_w)
     assert set(BPTT.presets()) == {"as-written", "as-coded", "ours"}
     assert kaiming(Plain()) == Plain()
+    ours = BPTT.ours(RECALL, MMU(hidden=20), updates=2)
+    assert (ours.batch_size, ours.updates, ours.l2, ours.max_norm) == (20, 2, 0.0, 0.1)
+    assert (ours.learning_rate, ours.decay) == (0.02, 0.9998)
+    assert ours.network == MMU(hidden=20, initializer="kaiming", start_weights="closed")
+    assert np.all(np.asarray(ours.init(key=KEY).champion.b_w) == -4.0)
+    assert BPTT.ours(RECALL, Recurrent("gru")).network == Recurrent("gru", initializer="kaiming")
 
 
 class Plain(eqx.Module):
@@ -306,6 +320,7 @@ def test_l2_as_printed_holds_the_network_at_nothing():
         (RECALL, {"checkpoint": 0}, "checkpoint is 0: it must be at least 1"),
         (RECALL, {"l2": -0.1}, "l2 is -0.1: it must be at least 0"),
         (RECALL, {"learning_rate": -1.0}, "learning_rate is -1.0"),
+        (RECALL, {"decay": 1.5}, r"decay is 1.5: it must lie in \[0, 1\]"),
         (RECALL, {"reduction": "max"}, "reduction is 'max': it must be one of mean, sum"),
         (RECALL, {"train_size": 10}, "train_size is 10: a batch of 1000 different sequences"),
     ],

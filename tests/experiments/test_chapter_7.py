@@ -25,7 +25,7 @@ def test_every_budget_has_cells_with_names_of_their_own(name):
 
 def test_every_method_has_the_same_team_discount_rates_and_updates():
     cells = [cell.algorithm for cell in fig_7_4.cells("full")]
-    assert len(cells) == 7 * 7 + 3
+    assert len(cells) == 7 * 7 + 6
     learners = [x for cell in cells for x in getattr(cell, "learners", ()) or ()]
     learners += [cell.learner for cell in cells if not isinstance(cell, MERL)]
     for name in ("gamma", "actor_lr", "critic_lr", "tau", "batch_size", "noise"):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from credo import cli
+from credo.algorithms.bptt import BPTT
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
@@ -23,7 +24,14 @@ CHAPTER3 = [name for name in base.MODULES if name.partition("-")[2].startswith("
 RESULTS = pathlib.Path(base.__file__).parents[3] / "results"
 SIZES = {"population_size": 10, "episodes": 4, "test_episodes": 6}
 SEEDS, GENERATIONS = 2, 12
+TINY_BPTT = {"batch_size": 10, "updates": 1, "test_episodes": 6}
 TINY = {
+    "classification 2-deep as written by gradient": BPTT.as_written(
+        SequenceClassification(depth=2, min_gap=1, max_gap=2), MMU(hidden=5), **TINY_BPTT
+    ),
+    "recall 1-deep ours by gradient": BPTT.ours(
+        SequenceRecall(depth=1, min_corridor=1, max_corridor=2), MMU(hidden=5), **TINY_BPTT
+    ),
     "classification 2-deep as coded": Neuroevolution.as_coded(
         SequenceClassification(depth=2, min_gap=1, max_gap=2), MMU(hidden=5), **SIZES
     ),
@@ -74,7 +82,17 @@ def cells_of(name: str, runs: dict[str, list[Run]]) -> dict[str, list[Run]]:
 def test_the_command_line_lists_what_there_is():
     assert list(cli.EXPERIMENTS) == list(base.MODULES)
     modules = {path.stem for path in pathlib.Path(base.__file__).parent.glob("*.py")}
-    shared = {"__init__", "base", "chapter3", "chapter5", "chapter6", "chapter7"}
+    shared = {
+        "__init__",
+        "base",
+        "chapter3",
+        "chapter3_gradient",
+        "chapter4",
+        "chapter4_fleet",
+        "chapter5",
+        "chapter6",
+        "chapter7",
+    }
     assert modules - shared == set(base.MODULES.values())
 
 

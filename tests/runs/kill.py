@@ -27,6 +27,12 @@ TEAM = (
 TRAIN = {
     "neuroevolution": "neuroevolution sequence-classification --depth 3 --min-gap 1 --max-gap 3 "
     "--population-size 20 --episodes 5 --network.hidden 3",
+    "bptt": "bptt sequence-recall --depth 2 --min-corridor 1 --max-corridor 3 --batch-size 20 "
+    "--updates 2 --network.hidden 3 --train-size 100",
+    "ccea": "ccea credo.environments.probes:Meet --population-size 6 --elite-fraction 0.2 "
+    "--teams 2 --episodes 2 --test-episodes 4 --network.hidden 4",
+    "dmmu": "neuroevolution credo.environments.probes:Meet --network dmmu --network.hidden 3 "
+    "--population-size 6 --elite-fraction 0.2 --episodes 2 --test-episodes 4",
     "erl": f"erl InvertedPendulum-v5 {SMALL} --sync-period 2",
     "cerl": f"cerl InvertedPendulum-v5 {SMALL}",
     "merl": f"merl {TEAM} --population-size 6 --elite-fraction 0.34 --episodes 2 --workers 4 "
@@ -36,6 +42,9 @@ TRAIN = {
 }
 GENERATIONS = {  # enough for 20 kills
     "neuroevolution": 100_000,
+    "bptt": 20_000,
+    "ccea": 60_000,
+    "dmmu": 20_000,
     "erl": 300,
     "cerl": 150,
     "merl": 30_000,

@@ -39,15 +39,11 @@ from ..rollout import evaluate
 from ..types import Evaluation, Metrics
 
 
-def _author_mutation() -> MatrixMutation:
-    return MatrixMutation(
-        gate="genome",
-        fraction=0.2,
-        up_to_fraction=True,
-        strength=0.2,
-        super_probability=0.05,
-        limit=1e12,
-    )
+def author_mutation(**fields: Any) -> MatrixMutation:
+    """The author's of 2017, with some fields changed."""
+    coded: dict[str, Any] = {"gate": "genome", "fraction": 0.2, "up_to_fraction": True}
+    coded |= {"strength": 0.2, "super_probability": 0.05, "limit": 1e12}
+    return MatrixMutation(**coded | fields)
 
 
 def _names(signals: str | tuple[str, ...]) -> tuple[str, ...]:
@@ -116,7 +112,7 @@ class Neuroevolution(eqx.Module):
         """The author's program of 2017: one gate per genome, up to 20 % of each matrix hit with
         20 % noise, 5 % of the hits super, repeated survivors replaced by row crossover."""
         return cls(
-            env, network, **{"mutation": _author_mutation(), "cross_repeated": True} | overrides
+            env, network, **{"mutation": author_mutation(), "cross_repeated": True} | overrides
         )
 
     @classmethod
@@ -126,7 +122,7 @@ class Neuroevolution(eqx.Module):
         also a curriculum, the share of right answers as fitness, and parsimony; on Sequence
         Classification the curriculum's signals persist. An MMU starts with saturated gates."""
         limit = 40.0
-        mutation = replace(_author_mutation(), limit=limit, reset_probability=0.1, reset_std=0.0)
+        mutation = author_mutation(limit=limit, reset_probability=0.1, reset_std=0.0)
         settings: dict[str, Any] = {"mutation": mutation}
         if isinstance(env, AbstractSequenceTask):
             persistent = isinstance(env, SequenceClassification)

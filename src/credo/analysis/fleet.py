@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from ..compilation import jit
 from ..environments.server_fleet import ACTS, AWAY, FleetState, ServerFleet, span
 from ..networks.base import AbstractPolicy
+from ..networks.dmmu import DMMUPolicy
 from .statistics import mean_and_standard_error
 
 HISTORIES = 2_000_000  # joint choices that the exact search may look at
@@ -203,7 +204,43 @@ def best_discovery(env: ServerFleet) -> float:
     return _search(env, rounds)
 
 
+class FleetTrace(eqx.Module):
+    """An episode of a fleet with one memory, step by step."""
+
+    net: Float[Array, " steps"]
+    acting: Bool[Array, "steps servers"]
+    device: Int[Array, "steps servers"]  # that was chosen, by who acted
+    writes: Float[Array, "steps servers cells"]  # what each server added to the memory
+    memory: Float[Array, "steps cells"]  # at the end of the step
+
+    @property
+    def signature(self) -> Int[Array, " cells"]:
+        """The cells in ascending order of what they hold in the end (Table 4.1)."""
+        return jnp.argsort(self.memory[-1], stable=True)
+
+
+def trace_fleet(
+    env: ServerFleet, policy: DMMUPolicy, genuine: Bool[Array, " devices"], *, key: PRNGKeyArray
+) -> FleetTrace:
+    """One episode with these classes."""
+    return _trace_fleet(env, policy, jnp.asarray(genuine), key)
+
+
 # Playing
+
+
+@jit
+def _trace_fleet(env: ServerFleet, policy: DMMUPolicy, genuine, key: PRNGKeyArray) -> FleetTrace:
+    def advance(loop, step):
+        state, now, carry = loop
+        action, carry, writes = policy.access(now.obs, carry)
+        acting = now.active
+        state, now = env.step(state, action, key=jax.random.fold_in(key, step))
+        seen = (now.rewards["net"], acting, jnp.argmax(action, axis=1), writes, carry.memory)
+        return (state, now, carry), seen
+
+    start = (*env.begin(genuine), policy.start(key=key))
+    return FleetTrace(*jax.lax.scan(advance, start, jnp.arange(env.max_steps))[1])
 
 
 def _action(device: Int[Array, " servers"], devices: int) -> Float[Array, "servers devices"]:

@@ -20,7 +20,7 @@ BUDGETS = chapter7.BUDGETS
 PLANS = {
     "smoke": Plan(1_500, 1),
     "quick": Plan(150_000, 1),
-    "full": Plan(500_000, 1),
+    "full": Plan(300_000, 1),
     "published": Plan(2_000_000, 1, 0.1),
 }
 PARTLY = {"smoke": 1_000, "quick": 25_000, "full": 25_000, "published": 100_000}  # frames

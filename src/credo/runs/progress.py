@@ -3,6 +3,7 @@
 import pathlib
 import sys
 import time
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn
@@ -61,9 +62,10 @@ class Progress:
         self.frame_rate = old * self.frame_rate + (1 - old) * rates[1]
         if not self.shown:
             return
+        best, value = best_of(row)
         text = (
             f"{self.budget.done(generation, frames)}  left {'…' if first else self.left()}  "
-            f"champion {row['champion_score']:.4g}  best fitness {row['fitness_max']:.4g}  "
+            f"champion {row['champion_score']:.4g}  {best} {value:.4g}  "
             f"{short(self.frame_rate)} frames/s"
         )
         share = self.budget.share(generation, frames)
@@ -90,6 +92,12 @@ class Progress:
     def __exit__(self, *_):
         if self.bar.live.is_started:
             self.bar.stop()
+
+
+def best_of(row: dict[str, Any]) -> tuple[str, float]:
+    """What an algorithm improves, in words and its value: fitness, or where there is none a loss.
+    `row`: the metrics of a generation."""
+    return ("best fitness", row["fitness_max"]) if "fitness_max" in row else ("loss", row["loss"])
 
 
 def clock(seconds: float) -> str:

@@ -37,7 +37,7 @@ def write(paths: list[pathlib.Path], target: pathlib.Path) -> pathlib.Path:
         command="credo report " + shlex.join(map(str, paths)),
         sections=[
             _figure(runs, "champion_score", "Champion on fresh episodes, as last tested"),
-            _figure(runs, "fitness_max", "Best fitness of each generation"),
+            *_improved(runs),
             _table(runs),
             *_attributions(runs),
             _settings(runs),
@@ -54,6 +54,21 @@ def write(paths: list[pathlib.Path], target: pathlib.Path) -> pathlib.Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     write_page(page, target)
     return target
+
+
+def _improved(runs: dict[str, list[Run]]) -> list[Figure]:
+    """What each algorithm improves: fitness, or a loss."""
+    titles = {"fitness_max": "Best fitness of each generation", "loss": "Loss of each generation"}
+    found = []
+    for metric, title in titles.items():
+        known = {
+            label: group
+            for label, group in runs.items()
+            if all(metric in run.metrics for run in group)
+            and (metric == "fitness_max" or "fitness_max" not in group[0].metrics)
+        }
+        found += [_figure(known, metric, title)] if known else []
+    return found
 
 
 def _lead(runs: dict[str, list[Run]]) -> str:

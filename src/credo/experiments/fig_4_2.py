@@ -1,0 +1,43 @@
+"""Figure 4.2: Converge, a learning robot beside a static one."""
+
+from typing import Any
+
+from . import chapter4
+from .base import Cell
+
+TITLE = "Extended T-Maze, Converge"
+PUBLISHED = (
+    "Figure 4.2 of the dissertation, 10 runs, mean ± standard error, %: MMU 41.3 ± 2.4 (FSP) and "
+    "33.7 ± 1.4 (RESP) 2-deep, 29.8 ± 2.7 and 28.0 ± 1.5 3-deep; feed-forward 15.0 ± 0.1, "
+    "16.5 ± 0.2, 7.1 ± 0.2, 8.0 ± 0.1."
+)
+BUDGETS = chapter4.BUDGETS
+GIVEN = {
+    "converge 2-deep, fsp, mmu": "41.3 ± 2.4",
+    "converge 2-deep, resp, mmu": "33.7 ± 1.4",
+    "converge 3-deep, fsp, mmu": "29.8 ± 2.7",
+    "converge 3-deep, resp, mmu": "28.0 ± 1.5",
+    "converge 2-deep, fsp, ff": "15.0 ± 0.1",
+    "converge 2-deep, resp, ff": "16.5 ± 0.2",
+    "converge 3-deep, fsp, ff": "7.1 ± 0.2",
+    "converge 3-deep, resp, ff": "8.0 ± 0.1",
+}
+
+
+def cells(budget: str) -> list[Cell]:
+    return chapter4.beside_a_static_robot("converge", budget)
+
+
+measure = chapter4.measure
+
+
+def sections(measured: dict[str, Any]) -> list[Any]:
+    return [
+        chapter4.scores(measured, GIVEN),
+        *chapter4.curves(measured),
+        chapter4.about(
+            "The author trained Converge with undisclosed bonuses for walking together and for "
+            "exploring; here the score alone is the fitness. Without memory a robot goes to the "
+            "first endpoint or to the last one, in every trial.",
+        ),
+    ]
