@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pathlib
 import re
 import shutil
 import subprocess
@@ -559,6 +560,23 @@ def test_a_team_of_pettingzoo_is_trained_by_its_name(credo, tmp_path):
     assert run.metrics["frames"].tolist() == [8, 16]
     assert run.metrics["updates"].tolist() == [4, 4]
     assert run.metrics["champion_score"][-1] < 0.0  # minus the distances to the landmarks
+
+
+def test_a_team_of_ones_own_is_given_its_time_limit(credo, tmp_path, monkeypatch):
+    pytest.importorskip("pettingzoo")
+    monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parent / "environments"))
+    path = tmp_path / "run"
+    flags = (
+        "--population-size 5 --elite-fraction 0.2 --episodes 1 --workers 1 --network.trunk 4 "
+        "--learners.0.batch-size 4 --warmup-frames 1000 --replay-capacity 50 --tensorboard False"
+    )
+    words = f"train merl broken_team:Pair --max-episode-steps=4 {flags} --generations 1"
+    code, _, err = credo(f"{words} --path {path}")
+    assert code == 0, err
+    assert Run(path).algorithm.env.max_episode_steps == 4
+    code, _, err = credo(f"train merl broken_team:Pair {flags} --path {tmp_path / 'other'}")
+    assert code != 0
+    assert "--max-episode-steps 1000, say" in err
 
 
 def test_list_shows_what_teams_need(credo):

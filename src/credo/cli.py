@@ -168,6 +168,7 @@ PRESETS = {
     "as-written": "Algorithm 2 as printed (the default)",
     "as-coded": "the author's operators of 2017",
     "ours": "the best settings found: start here for a task of your own; of erl, for late rewards",
+    "dmmu": "Algorithm 5: teams, whose agents change places too",
 }
 POPPED = ("--network", "--preset", "--delayed", "--from")  # flags that are no fields
 COMMANDS = {
@@ -280,7 +281,7 @@ def _train(argv: list[str]) -> None:
     delayed, argv = pop_switch(argv, "--delayed")
     if network_name and network_name not in NETWORKS:
         fail(f"no network {network_name!r}", network_name, NETWORKS)
-    env = _task(names[1])
+    env = _limited(_task(names[1]), argv)
     build, network = _builder(names[0], preset), None
     if network_name:
         path, fields, _ = NETWORKS[network_name]
@@ -301,6 +302,15 @@ def _train(argv: list[str]) -> None:
     if not warm_start:
         _note_start(algorithm, options.frames)
     _guarded(lambda: _start(algorithm, label, **fields))
+
+
+def _limited(env: Any, argv: list[str]) -> Any:
+    """A task outside JAX with the time limit that is among the flags: an algorithm may have to
+    open it (for how many agents?) before the flags are read."""
+    limit = plain_integer(pop_option(argv, "--max-episode-steps", "")[0])
+    if not limit.isdigit() or int(limit) < 1 or not hasattr(env, "max_episode_steps"):
+        return env  # what is wrong with it is said where flags are read
+    return dataclasses.replace(env, max_episode_steps=int(limit))
 
 
 def _on_a_team(algorithm: str, env: Any, network: Any) -> Any:

@@ -78,7 +78,8 @@ def room(elite_fraction: float, population: int, learners: int, workers: int) ->
     if not 1 <= int(elite_fraction * population) <= population - max(1, learners):
         raise ValueError(
             f"elite_fraction is {elite_fraction} of {population} members: that must be at least 1, "
-            f"and leave {max(1, learners)} slots for offspring"
+            f"and leave {max(1, learners)} for offspring; give {1 / population:.2g} or more, or "
+            "a larger population"
         )
     if workers < learners:
         raise ValueError(

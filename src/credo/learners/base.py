@@ -157,5 +157,5 @@ def require_memoryless(network: AbstractNetwork, policy: AbstractPolicy) -> None
     if jax.tree.leaves(jax.eval_shape(lambda: policy.start(key=jax.random.key(0)))):
         raise TypeError(
             f"{type(network).__name__} has memory, and this learner learns from single frames: "
-            "give a feed-forward network such as MLP, or evolve without a learner"
+            "give a feed-forward network such as MLP, or evolve without a learner: learners=()"
         )

@@ -17,6 +17,7 @@ import pathlib
 import re
 import shutil
 import signal
+import sys
 import threading
 import time
 import warnings
@@ -276,7 +277,8 @@ def _train(
     began = last_save = time.monotonic()
     safe, chunk, ended = generation, 1, False
 
-    with Signals() as signals, Progress(run.path, generation, frames, budget, progress) as bar:
+    board = Progress(run.path, generation, frames, budget, progress)
+    with Signals(quiet=not progress) as signals, board as bar:
         if reached:
             bar.say(f"is finished: {reached}; to go on give a larger --generations or --frames")
         else:
@@ -477,8 +479,9 @@ def _warn_of_other_machine(recorded: dict[str, Any]):
 class Signals:
     """Ctrl-C and SIGTERM ask for an end after the generation; a second one stops at once."""
 
-    def __init__(self):
+    def __init__(self, quiet: bool = True):
         self.received = 0
+        self.quiet = quiet
         self._before: dict[int, Any] = {}
 
     def __enter__(self):
@@ -491,6 +494,9 @@ class Signals:
         if self.received:
             raise SystemExit(128 + number)
         self.received = number
+        if not self.quiet:
+            told = "credo: stopping behind this generation; once more to stop at once"
+            print(f"\n{told}", file=sys.stderr, flush=True)
 
     def __exit__(self, *_):
         for number, handler in self._before.items():
