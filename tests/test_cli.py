@@ -16,6 +16,7 @@ from credo import cli
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Meet, Remember
 from credo.networks.mlp import MLP
+from credo.networks.team import Team
 from credo.runs.loop import Run
 
 TRAIN = (
@@ -562,6 +563,14 @@ def test_a_team_of_pettingzoo_is_trained_by_its_name(credo, tmp_path):
     assert run.metrics["champion_score"][-1] < 0.0  # minus the distances to the landmarks
 
 
+def test_each_agent_of_a_team_has_a_network_of_its_own():
+    team = cli._on_a_team("neuroevolution", Meet(), MLP())
+    assert team == Team(trunk=(), head=MLP(), sharing="nothing")
+    assert cli._on_a_team("merl", Meet(), team) is team
+    assert cli._on_a_team("ccea", Meet(), MLP()) == MLP()  # it has one per population
+    assert cli._on_a_team("neuroevolution", Remember(), MLP()) == MLP()
+
+
 def test_a_team_of_ones_own_is_given_its_time_limit(credo, tmp_path, monkeypatch):
     pytest.importorskip("pettingzoo")
     monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parent / "environments"))
@@ -592,7 +601,7 @@ def test_list_shows_what_teams_need(credo):
         ("train sac rover", "Rover has 6 agents: SAC cannot learn that. Evolve without a learner"),
         ("train ppo rover", "Rover has 6 agents: PPO cannot learn that. Evolve without a learner"),
         ("train cerl rover", "MLP acts for one agent and Rover has 6"),
-        ("train neuroevolution rover", "MMU acts for one agent and Rover has 6"),
+        ("train neuroevolution Pendulum-v1 --network dmmu", "DMMU acts for a team and Pendulum-v1"),
         ("train matd3 Pendulum-v1", "Team acts for a team and Pendulum-v1 has one agent"),
         ("train matd3 Pendulum-v1 --network mlp", "one agent"),
         ("train merl Pendulum-v1", "Team acts for a team and Pendulum-v1 has one agent"),
