@@ -165,7 +165,7 @@ EXPERIMENTS = {
     "check-spread": "MADDPG and MATD3 on simple_spread",
 }
 PRESETS = {
-    "as-written": "Algorithm 2 as printed (the default)",
+    "as-written": "Algorithm 2, or section 3.4, as printed (the default)",
     "as-coded": "the author's operators of 2017",
     "ours": "the best settings found: start here for a task of your own; of erl, for late rewards",
     "dmmu": "Algorithm 5: teams, whose agents change places too",
@@ -285,7 +285,10 @@ def _train(argv: list[str]) -> None:
     build, network = _builder(names[0], preset), None
     if network_name:
         path, fields, _ = NETWORKS[network_name]
-        network = _on_a_team(names[0], env, _load(path)(**fields))
+        try:
+            network = _on_a_team(names[0], env, _load(path)(**fields))
+        except ValueError as error:  # a task that cannot be opened
+            fail(str(error))
     prog = f"credo train {names[0]} {names[1]}"
     if delayed:
         from .environments import wrappers
@@ -308,7 +311,8 @@ def _limited(env: Any, argv: list[str]) -> Any:
     """A task outside JAX with the time limit that is among the flags: an algorithm may have to
     open it (for how many agents?) before the flags are read."""
     limit = plain_integer(pop_option(argv, "--max-episode-steps", "")[0])
-    if not limit.isdigit() or int(limit) < 1 or not hasattr(env, "max_episode_steps"):
+    fields = {f.name for f in dataclasses.fields(env)}
+    if not limit.isdigit() or int(limit) < 1 or "max_episode_steps" not in fields:
         return env  # what is wrong with it is said where flags are read
     return dataclasses.replace(env, max_episode_steps=int(limit))
 
@@ -333,7 +337,8 @@ tasks:      {", ".join(TASKS)}
             or package.module:Class
 networks:   {", ".join(NETWORKS)} (default: the algorithm's own)
             each agent of a team has a network of its own, unless it is one for teams
-presets:    {", ".join(PRESETS)} (default: as-written), of neuroevolution and bptt
+presets:    as-written (the default), as-coded, ours, of neuroevolution and bptt; dmmu, of
+            neuroevolution
             ours, of erl: for a reward that comes late
 
 credo train ALGORITHM TASK --help lists every flag with its unit and default."""

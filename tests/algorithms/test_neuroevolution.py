@@ -16,7 +16,7 @@ from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.server_fleet import ServerFleet
 from credo.evolution.agents import AgentCrossover
-from credo.evolution.crossover import MaskedCrossover, OnePointCrossover
+from credo.evolution.crossover import MaskedCrossover, NoCrossover, OnePointCrossover
 from credo.evolution.curriculum import Curriculum
 from credo.evolution.mutation import MatrixMutation
 from credo.networks.dmmu import DMMU
@@ -435,6 +435,8 @@ def test_a_curriculum_may_train_on_a_longer_task_and_tests_on_the_algorithms_own
         ({"fitness": ("reward", "speed")}, "no reward signal 'speed'"),
         ({"fitness": "speed"}, "no reward signal 'speed': this task has reward"),
         ({"score": "speed"}, "no reward signal 'speed'"),
+        ({"crossover": NoCrossover(), "cross_repeated": True}, "nobody would be crossed"),
+        ({"mating": (AgentCrossover(),)}, "agents of MMU have no weights of their own"),
     ],
 )
 def test_impossible_settings_are_refused(fields, told):

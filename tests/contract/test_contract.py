@@ -13,9 +13,9 @@ from credo.environments.base import AbstractEnvironment
 from credo.environments.probes import Copy, Meet, Remember
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
-from credo.evolution.crossover import MaskedCrossover
+from credo.evolution.crossover import AbstractCrossover, MaskedCrossover, OnePointCrossover
 from credo.evolution.extinction import Extinction
-from credo.evolution.mutation import GaussianMutation, MatrixMutation
+from credo.evolution.mutation import GaussianMutation, MatrixMutation, Mutations
 from credo.evolution.selection import Tournament, Truncation
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
@@ -40,10 +40,14 @@ ENVIRONMENTS = {
 GENETICS = {
     "matrix mutation": MatrixMutation(super_probability=0.1, reset_probability=0.1),
     "up to a fraction": MatrixMutation(up_to_fraction=True, gate="genome"),
+    "one in a row": MatrixMutation(one_in=3),
     "gaussian mutation": GaussianMutation(),
+    "mutations": Mutations((GaussianMutation(), MatrixMutation())),
     "matrix crossover": MaskedCrossover(part="matrix"),
     "row crossover": MaskedCrossover(part="row"),
     "entry crossover": MaskedCrossover(part="entry"),
+    "one point crossover": OnePointCrossover(probability=0.5),
+    "one row crossover": OnePointCrossover(probability=0.5, taken="row"),
     "extinction": Extinction(probability=0.5),
 }
 SELECTIONS = {"tournament": Tournament(), "truncation": Truncation()}
@@ -153,9 +157,9 @@ def test_environments(name):
 def operate(operator, genomes, others, key):
     """One operator on `N` genomes."""
     if isinstance(operator, Extinction):
-        return operator(genomes, others, key=key)
+        return operator(genomes, lambda: others, key=key)
     split = jax.random.split(key, N)
-    if isinstance(operator, MaskedCrossover):
+    if isinstance(operator, AbstractCrossover):
         return eqx.filter_vmap(lambda a, b, key: operator(a, b, key=key))(genomes, others, split)
     return eqx.filter_vmap(lambda genome, key: operator(genome, key=key))(genomes, split)
 

@@ -203,6 +203,8 @@ def test_and_only_where_the_gate_is_open():
     assert not (m["v"] != 2.0).any()
     with pytest.raises(ValueError, match="one_in is 3 and up_to_fraction is set"):
         MatrixMutation(one_in=3, up_to_fraction=True)
+    with pytest.raises(ValueError, match=r"one_in is 3 and fraction is 0.2: .* give one of them"):
+        MatrixMutation(one_in=3, fraction=0.2)
 
 
 def test_several_mutations_follow_each_other():

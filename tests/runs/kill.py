@@ -47,8 +47,8 @@ GENERATIONS = {  # enough for 20 kills
     "dmmu": 20_000,
     "erl": 300,
     "cerl": 150,
-    "merl": 30_000,
-    "matd3": 30_000,
+    "merl": 100_000,
+    "matd3": 150_000,
 }
 
 

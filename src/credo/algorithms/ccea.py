@@ -60,7 +60,7 @@ class CCEA(eqx.Module):
     assignment: Literal["mean", "best"] = eqx.field(static=True, default="mean")
     selection: AbstractSelection = Tournament()
     mutation: AbstractMutation = MatrixMutation()
-    crossover: AbstractCrossover | None = MaskedCrossover()  # as in Neuroevolution
+    crossover: AbstractCrossover = MaskedCrossover()
     crossover_probability: float = 0.0
     cross_repeated: bool = eqx.field(static=True, default=False)
     mating: tuple[AbstractCrossover, ...] = ()  # as in Neuroevolution

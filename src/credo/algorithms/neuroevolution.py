@@ -26,7 +26,7 @@ from ..compilation import jit
 from ..environments.base import AbstractEnvironment, AbstractSequenceTask
 from ..environments.sequence_classification import SequenceClassification
 from ..evolution.agents import AgentCrossover
-from ..evolution.crossover import AbstractCrossover, MaskedCrossover, OnePointCrossover
+from ..evolution.crossover import AbstractCrossover, MaskedCrossover, NoCrossover, OnePointCrossover
 from ..evolution.curriculum import Curriculum
 from ..evolution.extinction import Extinction
 from ..evolution.mutation import AbstractMutation, MatrixMutation
@@ -35,6 +35,7 @@ from ..evolution.selection import AbstractSelection, Tournament, rankable, ranki
 from ..networks.base import AbstractNetwork
 from ..networks.dmmu import DMMU
 from ..networks.mmu import MMU
+from ..networks.team import Team
 from ..rollout import evaluate
 from ..types import Evaluation, Metrics
 
@@ -48,6 +49,11 @@ def author_mutation(**fields: Any) -> MatrixMutation:
 
 def _names(signals: str | tuple[str, ...]) -> tuple[str, ...]:
     return (signals,) if isinstance(signals, str) else tuple(signals)
+
+
+def _apart(network: AbstractNetwork) -> bool:
+    """Whether each agent has weights of its own."""
+    return isinstance(network, DMMU) or (isinstance(network, Team) and network.sharing == "nothing")
 
 
 class NeuroevolutionState(eqx.Module):
@@ -69,7 +75,7 @@ class Neuroevolution(eqx.Module):
     test_episodes: int = eqx.field(static=True, default=50)  # fresh ones, for the champion
     selection: AbstractSelection = Tournament()
     mutation: AbstractMutation = MatrixMutation()
-    crossover: AbstractCrossover | None = MaskedCrossover()  # with an elite; None: never
+    crossover: AbstractCrossover = MaskedCrossover()  # with an elite
     crossover_probability: float = 0.0  # chance that an offspring has a second parent, an elite
     cross_repeated: bool = eqx.field(static=True, default=False)
     """Cross every parent that selection drew before, so that no two offspring are clones."""
@@ -100,6 +106,16 @@ class Neuroevolution(eqx.Module):
         if self.elites >= self.population_size:
             raise ValueError(
                 f"elite_fraction is {self.elite_fraction}: no room is left for offspring; lower it"
+            )
+        if isinstance(self.crossover, NoCrossover) and self.cross_repeated:
+            raise ValueError(
+                "crossover is NoCrossover and cross_repeated is set: nobody would be crossed; give "
+                "crossover=MaskedCrossover(), or leave cross_repeated out"
+            )
+        if any(isinstance(x, AgentCrossover) for x in self.mating) and not _apart(self.network):
+            raise ValueError(
+                f"mating has AgentCrossover, and agents of {type(self.network).__name__} have no "
+                "weights of their own: give DMMU or Team(sharing='nothing'), or leave it out"
             )
         for name in (*self.fitness, self.score):
             if name is not None and name not in self.env.signals:
@@ -140,11 +156,12 @@ class Neuroevolution(eqx.Module):
     def dmmu(cls, env: AbstractEnvironment, network: AbstractNetwork, **overrides) -> Self:
         """Algorithm 5 with the settings of section 4.2.1: for teams on the server fleet. Where
         agents share weights they do not change places."""
-        apart = isinstance(network, DMMU) or getattr(network, "sharing", None) == "nothing"
-        mating = (OnePointCrossover(), AgentCrossover()) if apart else (OnePointCrossover(),)
+        mating: tuple[AbstractCrossover, ...] = (OnePointCrossover(),)
+        if _apart(network):
+            mating = (*mating, AgentCrossover())
         settings: dict[str, Any] = {"elite_fraction": 0.04, "test_episodes": 10}
         settings["mutation"] = MatrixMutation(one_in=10)  # a fleet has 100,000 weights
-        settings |= {"crossover": None, "mating": mating, "extinction": Extinction()}
+        settings |= {"crossover": NoCrossover(), "mating": mating, "extinction": Extinction()}
         return cls(env, network, **settings | overrides)
 
     @classmethod
@@ -298,7 +315,7 @@ def recombine(
     """Give some offspring a random elite as the first parent."""
     chance_key, mate_key, cross_key = jax.random.split(key, 3)
     n = tree.size(offspring)
-    if algorithm.elites == 0 or algorithm.crossover is None:
+    if algorithm.elites == 0 or isinstance(algorithm.crossover, NoCrossover):
         return offspring
     mates = tree.take(elites, jax.random.randint(mate_key, (n,), 0, algorithm.elites))
     children = each(algorithm.crossover, mates, offspring, key=cross_key)

@@ -32,7 +32,7 @@ class AgentCrossover(AbstractCrossover):
         chance_key, source_key = jax.random.split(key)
         n = len(members(a))
         if self.source == "any":
-            pool = tree.stack(*members(b))
+            pool = tree.stack(*alike(b, "AgentCrossover(source='any')"))
             index = jax.random.randint(source_key, (n,), 0, n)
             b = b.with_members(tuple(tree.take(pool, index[i]) for i in range(n)))
         replaced = jax.random.bernoulli(chance_key, self.probability, (n,))
@@ -53,12 +53,12 @@ class Homogenize(AbstractMutation):
 
     def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
         event_key, model_key, share_key = jax.random.split(key, 3)
-        mine = members(genome)
-        n = len(mine)
-        model = tree.take(tree.stack(*mine), jax.random.randint(model_key, (), 0, n))
+        found = alike(genome, "Homogenize")
+        n = len(found)
+        model = tree.take(tree.stack(*found), jax.random.randint(model_key, (), 0, n))
         event = jax.random.bernoulli(event_key, self.probability)
         replaced = event & jax.random.bernoulli(share_key, self.share, (n,))
-        return genome.with_members(tuple(tree.where(replaced[i], model, mine[i]) for i in range(n)))
+        return exchanged(genome, genome.with_members((model,) * n), replaced)
 
 
 def members(team: PyTree) -> tuple[PyTree, ...]:
@@ -70,6 +70,17 @@ def members(team: PyTree) -> tuple[PyTree, ...]:
             "Team(sharing='nothing'), or leave out the operators that exchange agents"
         )
     return own
+
+
+def alike(team: PyTree, operator: str) -> tuple[PyTree, ...]:
+    """`members`, of one size; ValueError if they differ."""
+    found = members(team)
+    if len({jax.tree.structure(one) for one in found}) > 1:
+        raise ValueError(
+            f"{operator} puts any agent in the place of any other, and these differ in size: give "
+            "agents of one size, or AgentCrossover(source='same')"
+        )
+    return found
 
 
 def exchanged(team: PyTree, other: PyTree, replaced: Bool[Array, " agents"]) -> PyTree:

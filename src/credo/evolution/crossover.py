@@ -18,6 +18,13 @@ class AbstractCrossover(eqx.Module):
         """A child whose weights come from `a` or `b`."""
 
 
+class NoCrossover(AbstractCrossover):
+    """Nobody is crossed: the child is `b`, the offspring that was to have a second parent."""
+
+    def __call__(self, a: PyTree, b: PyTree, *, key: PRNGKeyArray) -> PyTree:
+        return b
+
+
 class MaskedCrossover(AbstractCrossover):
     """The child is `a` with parts of `b` in it, each with chance `probability`.
 

@@ -24,7 +24,8 @@ class Extinction(eqx.Module):
         self, population: PyTree, fresh: Callable[[], PyTree], *, key: PRNGKeyArray
     ) -> PyTree:
         """**Arguments:** `population` `[pop, ...]`; spare the elites by not passing them. `fresh`
-        makes another one like it, and is asked when there is an event alone."""
+        makes another one like it, and is asked when there is an event alone (under `vmap`
+        always)."""
         event_key, member_key = jax.random.split(key)
         event = jax.random.bernoulli(event_key, self.probability)
         dies = jax.random.bernoulli(member_key, self.magnitude, (tree.size(population),))

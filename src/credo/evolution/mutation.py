@@ -10,6 +10,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .. import require, tree
 
+FRACTION = 0.1  # the share of a matrix that is hit unless said
+
 
 class AbstractMutation(eqx.Module):
     @abc.abstractmethod
@@ -31,7 +33,7 @@ class MatrixMutation(AbstractMutation):
 
     probability: float = 0.9  # chance of the gate, in [0, 1]
     gate: Literal["matrix", "genome"] = eqx.field(static=True, default="matrix")
-    fraction: float = 0.1  # share of a matrix's entries that is hit, in [0, 1]
+    fraction: float = FRACTION  # share of a matrix's entries that is hit, in [0, 1]
     up_to_fraction: bool = eqx.field(static=True, default=False)
     """Draw the share anew for each matrix, uniformly up to `fraction` and at least one entry."""
     one_in: int | None = eqx.field(static=True, default=None)
@@ -56,6 +58,11 @@ class MatrixMutation(AbstractMutation):
             require.at_least("one_in", self.one_in, 1)
             if self.up_to_fraction:
                 raise ValueError(f"one_in is {self.one_in} and up_to_fraction is set: give one")
+            if isinstance(self.fraction, float) and self.fraction != FRACTION:
+                raise ValueError(
+                    f"one_in is {self.one_in} and fraction is {self.fraction}: one hit in "
+                    f"{self.one_in} leaves no fraction to choose; give one of them (one_in=None)"
+                )
 
     def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
         gate_key, hit_key, move_key = jax.random.split(key, 3)

@@ -51,9 +51,14 @@ def networks(hidden: int = 30) -> dict[str, AbstractNetwork]:
         "lstmne": alone(Recurrent("lstm", hidden, "tanh", "fan_in")),
         "lstmsm": DMMU(cell="lstm", hidden=hidden),
         "grusm": DMMU(cell="gru", hidden=hidden),
-        "ffne": alone(MLP(hidden=(hidden,), activation="sigmoid")),
-        "cnf": Centralized(MLP(hidden=(10 * hidden,), activation="sigmoid")),
+        "ffne": alone(reactive(hidden)),
+        "cnf": Centralized(reactive(10 * hidden)),
     }
+
+
+def reactive(hidden: int) -> MLP:
+    """Without memory; weights as small at first as those of the others, else outputs saturate."""
+    return MLP(hidden=(hidden,), activation="sigmoid", initializer="fan_in")
 
 
 class Plan(NamedTuple):
@@ -170,15 +175,16 @@ def scores(measured: dict[str, Any], published: dict[str, str]) -> Table:
     )
 
 
-def about(*paragraphs: str) -> Text:
+def about(episodes: int, *paragraphs: str) -> Text:
     """What to know before comparing."""
     return Text(
         "How to read it",
         [
-            "Algorithm 5 with k 100, 4 elites, 10 episodes per fitness, the same budget for every "
-            "network. Centralized networks have no agents that could change places. Mutation is "
-            "stronger than printed: half of the matrices, a tenth of their weights, 30 % noise, a "
-            "tenth of the hits super (10 times the weight) and a tenth drawn anew.",
+            f"Algorithm 5 with k 100, 4 elites, {episodes} episodes per fitness (printed: 10), the "
+            "same budget for every network. Centralized networks have no agents that could change "
+            "places. Mutation is stronger than printed: half of the matrices, a tenth of their "
+            "weights, 30 % noise, a tenth of the hits super (10 times the weight) and a tenth "
+            "drawn anew.",
             *paragraphs,
         ],
     )

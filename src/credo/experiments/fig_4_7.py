@@ -64,7 +64,8 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         chapter4_fleet.scores(measured, GIVEN),
         *chapter4_fleet.curves(measured),
         chapter4_fleet.about(
+            10,
             "The author's generations are 15,000, the budget `published` here. He let several "
-            "servers take the last request; here a request is served once."
+            "servers take the last request; here a request is served once.",
         ),
     ]

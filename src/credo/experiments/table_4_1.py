@@ -10,7 +10,7 @@ from ..analysis import fleet
 from ..environments.server_fleet import ServerFleet
 from ..networks.dmmu import DMMU
 from ..runs.loop import Run
-from ..runs.page import Table, Text
+from ..runs.page import Table
 from . import chapter4_fleet
 from .base import Cell
 from .chapter3 import rounded
@@ -26,6 +26,7 @@ CONFIGURATIONS = tuple(
     tuple(letter == "G" for letter in text)
     for text in ("GGNN", "NNGG", "NGGN", "GNNG", "GNGN", "NGNG")
 )
+EPISODES = 30  # per fitness: ten may miss a configuration
 GIVEN = (6.0, 4.0, 5.0, 4.0, 5.0, 4.0)
 PLANS = {
     "smoke": chapter4_fleet.Plan(4, 2),
@@ -36,7 +37,6 @@ PLANS = {
 
 
 def cells(budget: str) -> list[Cell]:
-    """More episodes per fitness than elsewhere: ten may miss a configuration."""
     return [
         chapter4_fleet.cell(
             "case study, dmmu",
@@ -44,7 +44,7 @@ def cells(budget: str) -> list[Cell]:
             DMMU(hidden=3),
             budget,
             PLANS[budget],
-            episodes=30,
+            episodes=EPISODES,
         )
     ]
 
@@ -99,14 +99,12 @@ def sections(measured: dict[str, Any]) -> list[Any]:
             "the devices that a fleet tries first. Signature: cells in ascending order.",
         ),
         every_run(measured),
-        Text(
-            "How to read it",
-            [
-                "Whoever knows the classes earns 6 in each configuration. A fleet has to find out: "
-                f"no fleet earns more than {measured['discoverable']:.3f} on average, the mean of "
-                "the published table, 28/6. The script that discovers earns "
-                f"{measured['discovering']:.2f}, random servers {measured['random']:.2f}.",
-            ],
+        chapter4_fleet.about(
+            EPISODES,
+            "Whoever knows the classes earns 6 in each configuration. A fleet has to find out: "
+            f"no fleet earns more than {measured['discoverable']:.3f} on average, the mean of the "
+            "published table, 28/6. The script that discovers earns "
+            f"{measured['discovering']:.2f}, random servers {measured['random']:.2f}.",
         ),
     ]
 

@@ -54,7 +54,7 @@ class AbstractPolicy(eqx.Module):
         """An action in [-1, 1] and the next carry."""
 
     def arranged(self) -> "AbstractPolicy":
-        """The same policy, laid out for many steps: rollouts ask for it once and act with it."""
+        """The same policy, laid out for many steps: rollouts in JAX ask for it once."""
         return self
 
 

@@ -13,11 +13,11 @@ A run is a folder:
 import contextlib
 import dataclasses
 import json
+import os
 import pathlib
 import re
 import shutil
 import signal
-import sys
 import threading
 import time
 import warnings
@@ -495,8 +495,8 @@ class Signals:
             raise SystemExit(128 + number)
         self.received = number
         if not self.quiet:
-            told = "credo: stopping behind this generation; once more to stop at once"
-            print(f"\n{told}", file=sys.stderr, flush=True)
+            # Not `print`: the signal may have come while the progress bar was being written.
+            os.write(2, b"\ncredo: stopping behind this generation; once more to stop at once\n")
 
     def __exit__(self, *_):
         for number, handler in self._before.items():
