@@ -365,12 +365,12 @@ def test_each_learner_has_a_slot_of_its_own_and_no_elites(cerl):
 
 
 def test_there_must_be_room_for_elites_and_for_every_learners_actor():
-    with pytest.raises(ValueError, match=r"elite_fraction is 0\.7 of 6.*leave 3 slots"):
+    with pytest.raises(ValueError, match=r"elite_fraction is 0\.7 of 6.*leave 3 for offspring"):
         dataclasses.replace(CERL, elite_fraction=0.7)
     assert dataclasses.replace(CERL, elite_fraction=0.5).elites == 3
     with pytest.raises(ValueError, match="at least 1"):
         dataclasses.replace(CERL, elite_fraction=0.1)
-    with pytest.raises(ValueError, match="leave 1 slots"):
+    with pytest.raises(ValueError, match="leave 1 for offspring"):
         dataclasses.replace(ALGORITHM, elite_fraction=1.0)
 
 

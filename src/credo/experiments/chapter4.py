@@ -1,6 +1,7 @@
 """Chapter 4, first half: cooperative coevolution in the Extended T-Maze, and its scores."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -93,23 +94,30 @@ def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
 
 
 def outcome(name: str, runs: list[Run]) -> dict[str, Any]:
-    """Curves of the champion team's tests, and the final teams in fresh evaluations that they
-    share, beside floors and what nobody can pass."""
+    """Learning of a cell, beside floors and what nobody can pass."""
+    env = runs[0].algorithm.env
+    kind, bound = tmaze.ceiling(env)
+    return learned(name, runs, EPISODES, "score", 4) | {
+        "floors": {name: round(share, 4) for name, share in floors(env).items()},
+        "ceiling": [kind, round(bound, 4)],
+    }
+
+
+def learned(name: str, runs: list[Run], episodes: int, signal: str, digits: int) -> dict[str, Any]:
+    """Curves of the champions' tests, and the final champions in fresh episodes that they share."""
     env = runs[0].algorithm.env
     champions = tree.stack(*(run.champion for run in runs))
-    played = evaluate(env, champions, EPISODES, key=jax.random.key(20_000))
+    played = evaluate(env, champions, episodes, key=jax.random.key(20_000))
     scores = np.stack([run.metrics["champion_score"] for run in runs])
     grid = np.unique(np.linspace(0, scores.shape[1] - 1, POINTS).astype(int))
     where, network = name.rsplit(", ", 1)
-    kind, bound = tmaze.ceiling(env)
+    smoothed = statistics.moving_average(scores, SMOOTHED)[:, grid]
     return {
         "where": where,
         "network": network,
         "generation": (grid + 1).tolist(),
-        "smoothed": attribution.plain(statistics.moving_average(scores, SMOOTHED)[:, grid], 3),
-        "final": attribution.plain(np.mean(played.of("score"), axis=1), 4),
-        "floors": {name: round(share, 4) for name, share in floors(env).items()},
-        "ceiling": [kind, round(bound, 4)],
+        "smoothed": attribution.plain(smoothed, digits - 1),
+        "final": attribution.plain(np.mean(played.of(signal), axis=1), digits),
     }
 
 
@@ -126,19 +134,27 @@ def floors(env: ExtendedTMaze) -> dict[str, float]:
 
 def curves(measured: dict[str, Any]) -> list[Figure]:
     """A figure per task: the champion team of each generation, smoothed."""
+    return by_place(
+        measured,
+        "share of trials",
+        lambda cell: cell["floors"] | {cell["ceiling"][0]: cell["ceiling"][1]},
+    )
+
+
+def by_place(
+    measured: dict[str, Any], y_label: str, levels: Callable[[dict[str, Any]], dict[str, float]]
+) -> list[Figure]:
+    """A figure per place, with every network and the levels of the place."""
     figures = []
     for where in dict.fromkeys(cell["where"] for cell in measured.values()):
         found = [cell for cell in measured.values() if cell["where"] == where]
-        kind, bound = found[0]["ceiling"]
-        lines = [Reference(name, share) for name, share in found[0]["floors"].items()]
-        lines.append(Reference(kind, bound))
         figures.append(
             Figure(
                 where,
                 "generation",
-                "share of trials",
+                y_label,
                 [Curve(cell["network"], cell["generation"], cell["smoothed"]) for cell in found],
-                references=tuple(lines),
+                references=tuple(Reference(*level) for level in levels(found[0]).items()),
                 caption=f"Mean of {SMOOTHED} generations, as the author's.",
             )
         )

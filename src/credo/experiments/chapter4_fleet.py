@@ -1,14 +1,13 @@
 """Chapter 4, second half: fleets of servers with shared, private or no memory, and their scores."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
-from .. import tree
 from ..algorithms.neuroevolution import Neuroevolution
-from ..analysis import attribution, fleet, statistics
+from ..analysis import fleet
 from ..environments.server_fleet import ServerFleet
 from ..evolution.mutation import MatrixMutation
 from ..networks.base import AbstractNetwork
@@ -16,16 +15,14 @@ from ..networks.dmmu import DMMU
 from ..networks.mlp import MLP
 from ..networks.recurrent import Recurrent
 from ..networks.team import Centralized, Team
-from ..rollout import evaluate
 from ..runs.loop import Run
-from ..runs.page import Curve, Figure, Reference, Table, Text
+from ..runs.page import Figure, Table, Text
+from . import chapter4
 from .base import Cell
+from .chapter4 import Plan as Plan
 
 BUDGETS = ("smoke", "quick", "full", "published")
 EPISODES = 500  # fresh ones for a final champion; the dissertation used 10
-POINTS = 100  # of a learning curve
-SMOOTHED = 100  # generations; the author's undisclosed moving average
-FIRST_SEED = 200  # settings were chosen by looking at seeds below
 
 
 MUTATION = MatrixMutation(
@@ -61,13 +58,6 @@ def reactive(hidden: int) -> MLP:
     return MLP(hidden=(hidden,), activation="sigmoid", initializer="fan_in")
 
 
-class Plan(NamedTuple):
-    """The runs of a cell."""
-
-    generations: int
-    runs: int
-
-
 PLANS = {
     "smoke": Plan(4, 2),
     "quick": Plan(100, 2),
@@ -85,28 +75,15 @@ def cell(
         algorithm = dataclasses.replace(
             algorithm, population_size=6, elite_fraction=0.2, episodes=2, test_episodes=2
         )
-    return Cell(name, algorithm, plan.generations, plan.runs, FIRST_SEED)
+    return Cell(name, algorithm, plan.generations, plan.runs, chapter4.FIRST_SEED)
 
 
 # ---------------------------------------------------------------------------------------- scores
 
 
 def outcome(name: str, runs: list[Run], references: dict[str, float]) -> dict[str, Any]:
-    """Curves of the champions' tests, and the final ones in fresh episodes that they share."""
-    env = runs[0].algorithm.env
-    champions = tree.stack(*(run.champion for run in runs))
-    played = evaluate(env, champions, EPISODES, key=jax.random.key(20_000))
-    scores = np.stack([run.metrics["champion_score"] for run in runs])
-    grid = np.unique(np.linspace(0, scores.shape[1] - 1, POINTS).astype(int))
-    where, network = name.rsplit(", ", 1)
-    return {
-        "where": where,
-        "network": network,
-        "generation": (grid + 1).tolist(),
-        "smoothed": attribution.plain(statistics.moving_average(scores, SMOOTHED)[:, grid], 2),
-        "final": attribution.plain(np.mean(played.of("net"), axis=1), 3),
-        "reference": references,
-    }
+    """Learning of a cell, beside floors and ceilings."""
+    return chapter4.learned(name, runs, EPISODES, "net", 3) | {"reference": references}
 
 
 def references(env: ServerFleet) -> dict[str, float]:
@@ -120,24 +97,12 @@ def references(env: ServerFleet) -> dict[str, float]:
 
 def curves(measured: dict[str, Any]) -> list[Figure]:
     """A figure per task: the champion of each generation, smoothed."""
-    figures = []
-    for where in dict.fromkeys(cell["where"] for cell in measured.values()):
-        found = [cell for cell in measured.values() if cell["where"] == where]
-        known = found[0]["reference"]
-        figures.append(
-            Figure(
-                where,
-                "generation",
-                "net requests served",
-                [Curve(cell["network"], cell["generation"], cell["smoothed"]) for cell in found],
-                references=(
-                    Reference("random", known["random"]),
-                    Reference("a script that discovers", known["discovering"]),
-                ),
-                caption=f"Mean of {SMOOTHED} generations, as the author's.",
-            )
-        )
-    return figures
+    names = {"random": "random", "discovering": "a script that discovers"}
+    return chapter4.by_place(
+        measured,
+        "net requests served",
+        lambda cell: {label: cell["reference"][name] for name, label in names.items()},
+    )
 
 
 def scores(measured: dict[str, Any], published: dict[str, str]) -> Table:
