@@ -7,6 +7,7 @@ import pytest
 
 from credo import tree
 from credo.algorithms.ccea import CCEA, assigned
+from credo.environments.extended_tmaze import ExtendedTMaze
 from credo.environments.probes import Meet
 from credo.networks.mlp import MLP
 
@@ -28,6 +29,13 @@ def test_balanced_teams_have_everybody_equally_often():
     members = np.asarray(balanced.drawn(key=jax.random.key(0)))
     assert [np.bincount(row).tolist() for row in members] == [[4] * 7] * 2
     assert (members[0] != members[1]).any()
+
+
+def test_without_partners_an_individual_plays_the_simulations_of_all_its_teams():
+    alone = CCEA(ExtendedTMaze(depth=1), population_size=6, elite_fraction=0.2, teams=3)
+    assert (alone.agents, alone.simulations) == (1, 3 * 7)
+    np.testing.assert_array_equal(alone.drawn(key=jax.random.key(0)), [[0, 1, 2, 3, 4, 5]])
+    assert SMALL.simulations == 2
 
 
 def test_fitness_is_the_mean_or_best_over_the_teams_of_a_member():

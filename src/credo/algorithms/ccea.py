@@ -11,7 +11,8 @@ Departures from the printed box:
 - "Assign reward to each member" (line 8) does not say how several teams make one fitness: it is
   their mean; `assignment="best"` takes the best (Wiegand et al. 2001). With a private signal, such
   as the difference reward, each member is assigned its own.
-- All teams of a generation play in the same worlds.
+- All teams of a generation play in the same worlds. With one population a team is its individual,
+  and its φ teams would repeat each other: it plays φ·z simulations instead, each in another world.
 - The operators are those of Algorithm 2; the author's code drew φ 1 and z 10, and crossed too.
 - Feed-forward networks have their biases mutated; the author's code left those alone.
 """
@@ -102,6 +103,11 @@ class CCEA(eqx.Module):
         """The reward that is assigned."""
         return self.fitness or self.env.signals[0]
 
+    @property
+    def simulations(self) -> int:
+        """z: of each team; of an individual without partners what its φ teams would have."""
+        return self.episodes * (self.teams if self.agents == 1 else 1)
+
     def new_population(self, *, key: PRNGKeyArray) -> PyTree:
         return eqx.filter_vmap(lambda key: self.network.init(*self.env.sizes[:2], key=key))(
             jax.random.split(key, self.population_size)
@@ -122,7 +128,7 @@ class CCEA(eqx.Module):
         members = self.drawn(key=team_key)
         teams = drafted(self, state.populations, members)
         # 7-8: run z independent simulations for team T_i; assign reward to each of its members.
-        played = evaluate(self.env, teams, self.episodes, key=play_key)
+        played = evaluate(self.env, teams, self.simulations, key=play_key)
         fitness = assigned(self, members, played.returns[self.signal])
         # 9-21: for each population: rank, keep the elites, select, mutate; now and then extinction.
         best = jnp.argmax(rankable(fitness), axis=1)
@@ -143,6 +149,8 @@ class CCEA(eqx.Module):
     def drawn(self, *, key: PRNGKeyArray) -> Int[Array, "agents teams"]:
         """Who is in which team."""
         k, agents = self.population_size, self.agents
+        if agents == 1:
+            return jnp.arange(k)[None]
         if self.teaming == "random":
             return jax.random.randint(key, (agents, k * self.teams), 0, k)
         every = jnp.broadcast_to(jnp.arange(k), (agents, self.teams, k))

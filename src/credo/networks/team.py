@@ -80,14 +80,21 @@ class TeamPolicy(AbstractPolicy):
     agents: int = eqx.field(static=True)
     rows: tuple[PyTree, PyTree] | None = None
     """Trunks and heads as `_each` takes them; of `arranged` policies alone."""
+    apart: bool = eqx.field(static=True, default=False)
+    """Whether agents are written out one by one, their carries a tuple; of `arranged` policies
+    that share nothing. In a population's products an axis of agents would be moved to and fro."""
 
     def arranged(self) -> "TeamPolicy":
         heads = tuple(head.arranged() for head in self.heads)
+        if self.config.sharing == "nothing":
+            return TeamPolicy(self.trunks, heads, self.config, self.agents, apart=True)
         rows = (_rows(self.trunks), _rows(heads))
         return TeamPolicy(self.trunks, self.heads, self.config, self.agents, rows)
 
     def start(self, *, key: PRNGKeyArray) -> PyTree:
         keys = jax.random.split(key, self.agents)
+        if self.apart:
+            return tuple(head.start(key=keys[i]) for i, head in enumerate(self.heads))
         return self._each(lambda _, head, key: head.start(key=key), keys)
 
     def __call__(
@@ -97,6 +104,10 @@ class TeamPolicy(AbstractPolicy):
             c = self.config
             return head(hidden_layers(trunk, obs, len(c.trunk), c.activation, "none"), carry)
 
+        if self.apart:
+            each = zip(self.trunks, self.heads, obs, carry, strict=True)
+            actions, carries = zip(*(one(*agent) for agent in each), strict=True)
+            return jnp.stack(actions), carries
         return self._each(one, obs, carry)
 
     @property
