@@ -9,6 +9,7 @@ import sys
 
 NAMES = (
     "sequence_generation",
+    "team_generation",
     "td3_update",
     "erl_hopper",
     "rover_step",

@@ -485,3 +485,15 @@ def test_spread_returns_are_equal_parts_of_what_was_paid(env):
     np.testing.assert_allclose(reward, np.repeat(returns / steps, steps), rtol=1e-6)
     assert np.count_nonzero(before) == 6  # the task paid at the end of each
     np.testing.assert_array_equal(spread.transitions.obs, experience.transitions.obs)
+
+
+@pytest.mark.parametrize("common", [True, False])
+def test_large_policies_play_in_turn_what_they_play_together(common, monkeypatch):
+    population = population_of(Copy(), MLP(hidden=(3,)))
+    key = jax.random.key(3)
+    together = rollout.evaluate(Copy(), population, EPISODES, common=common, key=key)
+    monkeypatch.setattr(tree, "CACHED", 1)
+    apart = rollout.evaluate(Copy(), population, EPISODES, common=common, key=key)
+    same = np.allclose(apart.returns["reward"], together.returns["reward"], atol=1e-5)
+    assert same == common  # worlds of one's own are drawn in another order
+    assert np.unique(np.asarray(apart.returns["reward"])).size == POP * EPISODES

@@ -55,7 +55,10 @@ def evaluate(
         return _play_on_host(env, population, episodes, episodes, common, False, key=key)[0]
     if isinstance(env, AbstractSequenceTask) and getattr(population, "features_first", False):
         return _answer(env, population, episodes, common, key=key)
-    return _play(env, population, episodes, jnp.int32(episodes), common, False, key=key)[0]
+    if tree.batch(population) < tree.size(population):
+        return _play_in_turn(env, population, episodes, common, key=key)
+    keys = jax.random.split(key)
+    return _play(env, population, episodes, jnp.int32(episodes), common, False, keys)[0]
 
 
 def collect(
@@ -76,7 +79,8 @@ def collect(
     wanted = episodes if wanted is None else wanted
     if isinstance(env, AbstractHostEnvironment):
         return _play_on_host(env, population, episodes, wanted, common, True, key=key)
-    return _play(env, population, episodes, jnp.int32(wanted), common, True, key=key)
+    keys = jax.random.split(key)
+    return _play(env, population, episodes, jnp.int32(wanted), common, True, keys)
 
 
 def score(
@@ -121,6 +125,22 @@ def _answer(
 
 
 @jit
+def _play_in_turn(
+    env: AbstractEnvironment, population: PyTree, episodes: int, common: bool, *, key: PRNGKeyArray
+) -> Evaluation:
+    """Large policies some at a time: their weights stay in the cache from step to step."""
+    world_key, policy_key = jax.random.split(key)
+
+    def play(given):
+        some, keys = given
+        pair = jnp.stack([world_key if common else keys[0, 0], keys[0, 1]])
+        return _play(env, some, episodes, jnp.int32(episodes), common, False, pair)[0]
+
+    keys = jax.random.split(policy_key, (tree.size(population), 2))
+    return tree.in_batches(play, (population, keys))
+
+
+@jit
 def _play(
     env: AbstractEnvironment,
     population: PyTree,
@@ -128,16 +148,13 @@ def _play(
     wanted: Int[Array, ""],
     common: bool,
     record: bool,
-    *,
-    key: PRNGKeyArray,
+    keys: PRNGKeyArray,
 ) -> tuple[Evaluation, Any]:
     """All lanes `[pop, episodes]` take each step together, so that a row of the buffer is written
-    in place; a `vmap` of whole episodes would copy the buffer at every step. `record`: the second
-    result is the `Experience`, not None."""
-    pop = tree.size(population)
-    lanes = (pop, episodes)
-    world_key, policy_key = jax.random.split(key)
-    worlds = world_keys(pop, episodes, common, key=world_key)
+    in place; a `vmap` of whole episodes would copy the buffer at every step. `keys`: of worlds and
+    of policies. `record`: the second result is the `Experience`, not None."""
+    (world_key, policy_key), lanes = keys, (tree.size(population), episodes)
+    worlds = world_keys(*lanes, common, key=world_key)
     reset_keys, step_keys = jnp.moveaxis(_each(jax.random.split)(worlds), 2, 0)
     states, first = _each(lambda key: env.reset(key=key))(reset_keys)
     population = eqx.filter_vmap(lambda policy: policy.arranged())(population)

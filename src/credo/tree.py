@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+CACHED = 250_000  # numbers that stay in a core's cache
+
 
 def size(population: PyTree) -> int:
     """How many members."""
@@ -78,6 +80,28 @@ def packing(population: PyTree) -> tuple[Callable[[PyTree], PyTree], Callable[[P
         return eqx.combine(eqx.filter(unravel(vector), eqx.is_inexact_array), arrays, static)
 
     return pack, unpack
+
+
+def batch(members: PyTree) -> int:
+    """How many members have their weights in the cache of a core together; divides their number."""
+    n, weights = size(members), jax.tree.leaves(eqx.filter(members, eqx.is_inexact_array))
+    fit = max(CACHED * n // max(sum(x.size for x in weights), 1), 1)
+    return max(d for d in range(1, min(n, fit) + 1) if n % d == 0)
+
+
+def in_batches(function: Callable[[PyTree], PyTree], members: PyTree) -> PyTree:
+    """`function` of a population, called for one `batch` after the other.
+
+    Large genomes would go through memory once per operation; and XLA would merge what is done to
+    all of them into few programs that take minutes to compile.
+    """
+    n, some = size(members), batch(members)
+    if some == n:
+        return function(members)
+    arrays, rest = eqx.partition(members, eqx.is_array)
+    split = jax.tree.map(lambda x: x.reshape(-1, some, *x.shape[1:]), arrays)
+    done = jax.lax.map(lambda x: function(eqx.combine(x, rest)), split)
+    return jax.tree.map(lambda x: x.reshape(n, *x.shape[2:]), done)
 
 
 class Layout(eqx.Module):

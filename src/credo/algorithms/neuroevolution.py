@@ -276,9 +276,12 @@ def breed(
 
     def each(operator, *parents: PyTree, key: PRNGKeyArray) -> PyTree:
         """What an operator makes of each of the parents."""
-        return eqx.filter_vmap(
-            lambda key, *parents: pack(operator(*map(unpack, parents), key=key))
-        )(jax.random.split(key, n), *parents)
+
+        def one(given):
+            key, *genomes = given
+            return pack(operator(*map(unpack, genomes), key=key))
+
+        return tree.in_batches(jax.vmap(one), (jax.random.split(key, n), *parents))
 
     # 6-7: Rank the population; select the first e as elites.
     elites = tree.take(rows, ranking(fitness)[: algorithm.elites])

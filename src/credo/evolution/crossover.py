@@ -75,6 +75,8 @@ class OnePointCrossover(AbstractCrossover):
         rows = np.diff(np.append(first, layout.rows))
         gate = jax.random.bernoulli(gate_key, self.probability, (n,))
         point = first + jax.random.randint(point_key, (n,), 0, rows)
+        # Written down: XLA would repeat the division behind `randint` for every entry.
+        point = jnp.zeros(n, point.dtype).at[jnp.arange(n)].set(point)
         reached = layout.row >= point[layout.leaf]
         if self.taken == "row":
             reached = layout.row == point[layout.leaf]
