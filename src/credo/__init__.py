@@ -81,6 +81,7 @@ _EXPORTS = {
     "AbstractHostEnvironment": "environments.host",
     "Gymnasium": "environments.gymnasium",
     "delayed": "environments.wrappers",
+    "NoisyObservations": "environments.wrappers",
     "Runner": "runner",
     "export": "runs.export",
     "watch": "runs.watch",

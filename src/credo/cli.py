@@ -144,6 +144,7 @@ EXPERIMENTS = {
     "fig-4.7": "server fleet, DMMU and baselines",
     "fig-4.8": "writes to the shared memory, by server",
     "table-4.1": "case study of two servers, six configurations",
+    "beyond-4": "difference rewards, depth 4, LSTM teams, noise, fleets that change",
     "check-td3": "TD3 alone, against its authors",
     "check-learners": "DDPG, SAC and TD3 alone, on cheap tasks",
     "fig-5.2": "standard and hard inverted double pendulum",
@@ -451,7 +452,8 @@ def _evaluate(argv: list[str]) -> None:
 
 @dataclasses.dataclass
 class WatchOptions:
-    """Show a champion: rovers in a page that plays, tasks of Gymnasium in a film."""
+    """Show a champion: rovers in a page that plays, a T-maze in a page of pictures, tasks of
+    Gymnasium in a film."""
 
     episodes: int = 1  # one after the other
     seed: int = 0  # of the first episode; the next ones count up

@@ -13,6 +13,7 @@ from credo.environments.base import AbstractEnvironment
 from credo.environments.probes import Copy, Meet, Remember
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
+from credo.environments.wrappers import NoisyObservations, delayed
 from credo.evolution.crossover import AbstractCrossover, MaskedCrossover, OnePointCrossover
 from credo.evolution.extinction import Extinction
 from credo.evolution.mutation import GaussianMutation, MatrixMutation, Mutations
@@ -36,6 +37,8 @@ ENVIRONMENTS = {
     "copy": Copy(size=2, max_steps=2),
     "remember": Remember(delay=1),
     "meet": Meet(),
+    "delayed": delayed(Meet()),
+    "noisy": NoisyObservations(Meet(), 0.1, spared=1),
 }
 GENETICS = {
     "matrix mutation": MatrixMutation(super_probability=0.1, reset_probability=0.1),

@@ -1,4 +1,5 @@
-"""A shortened task is the whole one up to its n-th question; a delayed one pays at the end."""
+"""A shortened task is the whole one up to its n-th question; a delayed one pays at the end; a noisy
+one is the same world, told with errors."""
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +12,11 @@ from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Meet
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
+from credo.environments.server_fleet import ServerFleet
 from credo.environments.wrappers import (
     DelayedHostReward,
     DelayedReward,
+    NoisyObservations,
     Shortened,
     delayed,
 )
@@ -24,6 +27,7 @@ TASKS = {
     "recall": SequenceRecall(depth=4, min_corridor=1, max_corridor=3),
 }
 KEYS = jax.random.split(jax.random.key(0), 16)
+FLEET = ServerFleet(servers=3, devices=4, requests=2, nefarious=2, max_steps=5)
 
 
 def sample(task):
@@ -142,3 +146,84 @@ def test_the_wrong_kind_of_task_is_refused():
         DelayedReward(Gymnasium("Pendulum-v1"))
     with pytest.raises(ValueError, match=r"Meet is no host task: use delayed\(env\)"):
         DelayedHostReward(Meet())
+
+
+@pytest.fixture(scope="module")
+def told():
+    """500 episodes of a fleet, and the same told with noise: time steps `[episodes, steps, ...]`,
+    and of the noisy ones also the states."""
+
+    def episode(key, std):
+        env = NoisyObservations(FLEET, std, spared=1)
+        reset_key, step_key = jax.random.split(key)
+
+        def advance(states, t):
+            key = jax.random.fold_in(step_key, t)
+            action = jax.random.uniform(jax.random.fold_in(key, 7), (3, 4))
+            state, now = FLEET.step(states[0], action, key=jax.random.split(key)[0])
+            noisy_state, noisy = env.step(states[1], action, key=key)
+            return (state, noisy_state), (now, noisy, state, noisy_state)
+
+        start, first = FLEET.reset(key=jax.random.split(reset_key)[0])
+        noisy_start, noisy_first = env.reset(key=reset_key)
+        _, steps = jax.lax.scan(advance, (start, noisy_start), jnp.arange(FLEET.max_steps))
+        begun = (first, noisy_first, start, noisy_start)
+        return jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), begun, steps)
+
+    play = jax.jit(jax.vmap(episode, (0, None)))
+    keys = jax.random.split(jax.random.key(3), 500)
+    found = {std: jax.tree.map(np.asarray, play(keys, std)) for std in (0.0, 0.5)}
+    assert play._cache_size() == 1  # how much noise there is is data
+    return found
+
+
+def test_a_noisy_world_is_the_same_one(told):
+    for std in (0.0, 0.5):
+        now, noisy, state, noisy_state = told[std]
+        for x, y in zip(jax.tree.leaves(state), jax.tree.leaves(noisy_state), strict=True):
+            np.testing.assert_array_equal(x, y)
+        np.testing.assert_array_equal(noisy.rewards["net"], now.rewards["net"])
+        np.testing.assert_array_equal(noisy.active, now.active)
+        np.testing.assert_array_equal(noisy.truncated, now.truncated)
+    assert np.any(now.rewards["net"] != 0)
+    now, noisy, _, _ = told[0.0]
+    np.testing.assert_array_equal(noisy.obs, now.obs)
+
+
+def test_noise_is_normal_and_of_every_entry_its_own_but_spares_the_status(told):
+    now, noisy, _, _ = told[0.5]
+    np.testing.assert_array_equal(noisy.obs[..., -1], now.obs[..., -1])
+    noise = (noisy.obs - now.obs)[..., :-1]  # [episodes, steps, servers, entries]
+    count = noise.size
+    assert abs(noise.mean()) < 4 * 0.5 / count**0.5
+    assert noise.std() == pytest.approx(0.5, abs=4 * 0.5 / (2 * count) ** 0.5)
+    assert np.mean(np.abs(noise) > 2 * 0.5) == pytest.approx(0.0455, abs=0.003)
+    # By step, server and entry, of all episodes: no two go together.
+    rows = np.corrcoef(noise.reshape(len(noise), -1).T)
+    assert np.abs(rows - np.eye(len(rows))).max() < 5.5 / len(noise) ** 0.5
+
+
+def test_a_noisy_task_keeps_the_contract():
+    env = NoisyObservations(FLEET, 0.5, spared=1)
+    assert check_environment(env) == []
+    assert env.sizes == FLEET.sizes == (9, 4, 3)
+    assert (env.signals, env.max_steps, env.reported) == (("net",), 5, "net")
+    assert env.obs_range == (-np.inf, np.inf)
+    assert check_environment(delayed(env)) == []
+    alone = NoisyObservations(TASKS["recall"], 0.1)
+    assert check_environment(alone) == []
+    policy = MMU(hidden=3).init(alone.obs_size, 1, key=jax.random.key(1))
+    returns = rollout.evaluate(alone, tree.stack(policy), 8, key=jax.random.key(2)).returns
+    assert {x.shape for x in returns.values()} == {(1, 8)}
+
+
+def test_noise_that_cannot_be_is_refused():
+    with pytest.raises(ValueError, match=r"std is -0\.1: it must be at least 0"):
+        NoisyObservations(FLEET, -0.1)
+    with pytest.raises(ValueError, match=r"std is nan"):
+        NoisyObservations(FLEET, float("nan"))
+    for spared in (-1, 9):  # of nine entries
+        with pytest.raises(ValueError, match=rf"spared is {spared}: it must lie in \[0, 8\]"):
+            NoisyObservations(FLEET, 0.5, spared=spared)
+    with pytest.raises(ValueError, match="Gymnasium is no JAX task: noise is added to those"):
+        NoisyObservations(Gymnasium("Pendulum-v1"), 0.5)

@@ -21,7 +21,7 @@ from credo.rollout import evaluate
 from credo.runs import checkpoint, config, log, page, report
 from credo.runs.loop import Run
 
-OTHERS = ("3.", "3", "4.", "7.", "7", "sp")  # chapters 3, 4 and 7
+OTHERS = ("3.", "3", "4.", "4", "7.", "7", "sp")  # chapters 3, 4 and 7
 NAMES = [name for name in base.MODULES if name.partition("-")[2][:2] not in OTHERS]
 GENERATIONS, FRAMES = 20, 100  # per generation
 

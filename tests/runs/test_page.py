@@ -10,7 +10,18 @@ import pytest
 
 from credo.analysis.statistics import bootstrap_interval
 from credo.runs import plots
-from credo.runs.page import Curve, Figure, HeatMap, Page, Reference, Table, Text, write
+from credo.runs.page import (
+    Curve,
+    Figure,
+    HeatMap,
+    Page,
+    Reference,
+    Table,
+    Text,
+    Track,
+    Tracks,
+    write,
+)
 from credo.runs.page import cell_text as shown
 
 HOSTILE = '<script>alert(\'x\')</script> & "$a_$" id="f"'
@@ -39,6 +50,24 @@ def heat_map(**changes) -> HeatMap:
         "y_label": "cell",
     }
     return HeatMap(**(arguments | changes))
+
+
+def tracks(**changes) -> Tracks:
+    arguments = {
+        "title": "Walk",
+        "tracks": [
+            Track("robot", [0, 1, 1, 2], ["", "told", "", ""]),
+            Track("static", [0] * 4, (), True),
+        ],
+        "goals": [0, 2, 1, 1],
+        "reached": [True, False, True, False],
+        "row_labels": ["a", "b", "c"],
+        "column_labels": list("1234"),
+        "x_label": "trial",
+        "y_label": "endpoint",
+        "breaks": (2,),
+    }
+    return Tracks(**(arguments | changes))
 
 
 class Reader(HTMLParser):
@@ -85,6 +114,7 @@ def html(tmp_path_factory) -> str:
             heat_map(row_labels=[HOSTILE, "b", "c"]),
             Table(HOSTILE, [HOSTILE, "n"], [(HOSTILE, 1.5), ("0.50", None)], HOSTILE),
             bad,
+            tracks(tracks=[Track(HOSTILE, [0, 1, 2, 2], [HOSTILE] * 4)], goal_label=HOSTILE),
         ],
         {HOSTILE: HOSTILE},
     )
@@ -95,8 +125,9 @@ def html(tmp_path_factory) -> str:
 
 def test_page_is_well_formed_and_has_its_sections(html):
     page = Reader(html)
-    assert page.tags["svg"] == 2 * 4
-    assert page.tags["table"] == page.tags["title"] == page.tags["h1"] == 1
+    assert page.tags["svg"] == 2 * 5
+    assert page.tags["table"] == 2
+    assert page.tags["title"] == page.tags["h1"] == page.tags["details"] == 1
     assert ("lang", "en") in page.attributes
     assert ("name", "viewport") in page.attributes
     labels = [value for name, value in page.attributes if name == "aria-label"]
@@ -284,6 +315,41 @@ def test_column_labels_are_all_shown_turned_or_thinned(columns, label, ticks, ro
     assert {text.get_rotation() for text in shown_labels} == {rotation}
 
 
+@pytest.mark.parametrize("dark", [False, True])
+def test_tracks_mark_everybody_the_goals_and_the_breaks(dark):
+    theme = plots.DARK if dark else plots.LIGHT
+    axes = drawn(tracks(), dark).axes[0]
+    line, *lines = axes.lines
+    assert (set(line.get_xdata()), line.get_color()) == ({1.5}, theme.ink)
+    marks = [x for x in lines if x.get_linewidth() == 0]
+    assert [x.get_marker() for x in marks] == ["o", "X"]
+    assert [x.get_color() for x in marks] == [theme.curves[0], theme.ink]
+    for mark, track in zip(marks, tracks().tracks, strict=True):
+        np.testing.assert_array_equal(np.round(mark.get_ydata()), track.rows)
+        np.testing.assert_array_equal(np.round(mark.get_xdata()), range(4))
+    assert not set(zip(*marks[0].get_data(), strict=True)) & set(
+        zip(*marks[1].get_data(), strict=True)
+    )
+    squares = [x for x in axes.patches if x.get_height() < 1]
+    assert [round(x.get_y() + 0.46) for x in squares] == [0, 2, 1, 1]
+    assert [x.get_linestyle() == "solid" for x in squares] == [True, False, True, False]
+    columns = [x.get_x() + 0.5 for x in axes.patches if x.get_height() == 3]
+    assert columns == [0, 2]
+
+
+def test_tracks_say_the_same_in_words():
+    assert tracks().table.columns == ["trial", "goal", "robot", "static"]
+    assert tracks().table.rows == [
+        ["1", "a, reached", "a", "a"],
+        ["2", "c, missed", "b, told", "a"],
+        ["3", "b, reached", "b", "a"],
+        ["4", "b, missed", "c", "a"],
+    ]
+    told = "Walk: endpoint of robot, static against trial; goal reached in 2 of 4"
+    assert plots.description(tracks()) == told
+    assert plots.note(tracks()) == ""
+
+
 @pytest.mark.parametrize(
     ("cell", "text"),
     [
@@ -357,6 +423,9 @@ def test_describing_a_page_loads_neither_jax_nor_matplotlib():
         (lambda: figure(y_range=(1.0, 0.0)), r"give \(low, high\)"),
         (lambda: figure(centre="mode"), "'mean' or 'median'"),
         (lambda: heat_map(row_labels=["a"]), r"values must be \[rows, columns\]"),
+        (lambda: tracks(goals=[0]), r"\[4, 1, 4, 4, 4\] outcomes, goals, rows and notes: give"),
+        (lambda: tracks(tracks=[]), "0 tracks .* give at least one track"),
+        (lambda: tracks(goals=[0, 1, 2, 3]), r"goal in rows \[0, 1, 2, 3\]: each must be in 0..2"),
         (lambda: Table("t", ["a", "b"], [("x",)]), "a row of 1 cells"),
     ],
 )

@@ -290,7 +290,7 @@ def test_an_mp4_of_rovers_has_every_step(tmp_path, episodes):
     ("env", "output", "error", "told"),
     [
         (ENV, "a.webm", ValueError, r"a\.webm': its name must end in \.html, \.mp4 or \.gif"),
-        (SimpleSpread(), None, RunError, "SimpleSpread has nothing to draw.* are rovers and tasks"),
+        (SimpleSpread(), None, RunError, "SimpleSpread has nothing to draw.* are rovers, T-mazes"),
     ],
     ids=["suffix", "task"],
 )

@@ -157,7 +157,7 @@ def test_without_a_name_the_film_lies_in_the_run(tmp_path):
 @pytest.mark.parametrize("output", [None, "film.gif"])
 def test_a_task_of_numbers_has_nothing_to_draw(tmp_path, output):
     run = made(tmp_path / "run", SequenceRecall(depth=2))
-    told = r"nothing to draw.*rovers and tasks of Gymnasium\. `credo report .*run` shows"
+    told = r"nothing to draw.*rovers, T-mazes and tasks of Gymnasium\. `credo report .*run` shows"
     with pytest.raises(RunError, match=told):
         watch(run, output and tmp_path / output)
     assert [p.name for p in tmp_path.iterdir()] == ["run"]

@@ -1,10 +1,12 @@
 """Tasks made of other tasks."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
+from .. import require
 from ..types import Sequence, TimeStep
 from .base import AbstractEnvironment, AbstractSequenceTask
 from .host import AbstractCopies, AbstractHostEnvironment, HostStep
@@ -44,28 +46,10 @@ class Shortened(AbstractSequenceTask):
         return self.task.reward(answer, target, scored, perfect)
 
 
-def delayed(
-    env: AbstractEnvironment | AbstractHostEnvironment,
-) -> "DelayedReward | DelayedHostReward":
-    """The hard variant of a task: the whole return is paid at the last step of the episode."""
-    if isinstance(env, AbstractHostEnvironment):
-        return DelayedHostReward(env)
-    return DelayedReward(env)
-
-
-class DelayedState(eqx.Module):
-    inner: PyTree
-    earned: dict[str, Array]  # since the episode began
-
-
-class DelayedReward(AbstractEnvironment):
-    """A JAX task that pays the sum of every reward signal at the last step, and 0 before."""
+class AbstractWrapper(AbstractEnvironment):
+    """A JAX task with the sizes and the signals of another one."""
 
     env: AbstractEnvironment
-
-    def __check_init__(self):
-        if not isinstance(self.env, AbstractEnvironment):
-            raise ValueError(f"{type(self.env).__name__} is no JAX task: use delayed(env)")
 
     @property
     def obs_size(self) -> int:
@@ -90,6 +74,67 @@ class DelayedReward(AbstractEnvironment):
     @property
     def reported(self) -> str:
         return self.env.reported
+
+
+class NoisyObservations(AbstractWrapper):
+    """A JAX task whose observations are told with noise N(0, std²), drawn anew for every entry,
+    agent and step. What happens in the world is not noisy.
+
+    Named as future work of the server fleet by Khadka (2019), section 4.2.5. Its status must stay
+    readable: `NoisyObservations(ServerFleet(), 0.5, spared=1)`.
+    """
+
+    std: float  # at least 0; one number for all entries, in the units of each
+    spared: int = eqx.field(static=True, default=0)
+    """How many entries at the end of an observation are told exactly, 0..obs_size - 1."""
+
+    def __check_init__(self):
+        if not isinstance(self.env, AbstractEnvironment):
+            raise ValueError(
+                f"{type(self.env).__name__} is no JAX task: noise is added to those alone"
+            )
+        require.at_least("std", self.std, 0)
+        require.within("spared", self.spared, 0, self.obs_size - 1)
+
+    # Of `obs_range` the default is left: noise has no bounds.
+
+    def reset(self, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
+        world_key, noise_key = jax.random.split(key)
+        state, first = self.env.reset(key=world_key)
+        return state, self._told(first, key=noise_key)
+
+    def step(self, state: PyTree, action: Array, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
+        world_key, noise_key = jax.random.split(key)
+        state, now = self.env.step(state, action, key=world_key)
+        return state, self._told(now, key=noise_key)
+
+    def _told(self, now: TimeStep, *, key: PRNGKeyArray) -> TimeStep:
+        noisy = jnp.arange(self.obs_size) < self.obs_size - self.spared
+        noise = self.std * jax.random.normal(key, now.obs.shape)
+        obs = now.obs + jnp.where(noisy, noise, 0.0)
+        return TimeStep(obs, now.rewards, now.terminated, now.truncated, now.active)
+
+
+def delayed(
+    env: AbstractEnvironment | AbstractHostEnvironment,
+) -> "DelayedReward | DelayedHostReward":
+    """The hard variant of a task: the whole return is paid at the last step of the episode."""
+    if isinstance(env, AbstractHostEnvironment):
+        return DelayedHostReward(env)
+    return DelayedReward(env)
+
+
+class DelayedState(eqx.Module):
+    inner: PyTree
+    earned: dict[str, Array]  # since the episode began
+
+
+class DelayedReward(AbstractWrapper):
+    """A JAX task that pays the sum of every reward signal at the last step, and 0 before."""
+
+    def __check_init__(self):
+        if not isinstance(self.env, AbstractEnvironment):
+            raise ValueError(f"{type(self.env).__name__} is no JAX task: use delayed(env)")
 
     @property
     def obs_range(self) -> tuple[float, float]:

@@ -38,6 +38,7 @@ MODULES = {
     "fig-4.7": "fig_4_7",
     "fig-4.8": "fig_4_8",
     "table-4.1": "table_4_1",
+    "beyond-4": "beyond_4",
     "check-td3": "check_td3",
     "check-learners": "check_learners",
     "fig-5.2": "fig_5_2",

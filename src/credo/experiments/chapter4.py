@@ -10,14 +10,15 @@ import numpy as np
 from .. import tree
 from ..algorithms.ccea import CCEA
 from ..algorithms.neuroevolution import author_mutation
-from ..analysis import attribution, statistics, tmaze
+from ..analysis import attribution, maze_trace, statistics, tmaze
 from ..environments.extended_tmaze import ExtendedTMaze
 from ..networks.base import AbstractNetwork
 from ..networks.mlp import MLP
 from ..networks.mmu import MMU
 from ..rollout import evaluate
+from ..runs import maze_page
 from ..runs.loop import Run
-from ..runs.page import Curve, Figure, Reference, Table, Text
+from ..runs.page import Curve, Figure, HeatMap, Reference, Table, Text, Tracks
 from .base import Cell
 
 BUDGETS = ("smoke", "quick", "full", "published")
@@ -94,13 +95,27 @@ def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
 
 
 def outcome(name: str, runs: list[Run]) -> dict[str, Any]:
-    """Learning of a cell, beside floors and what nobody can pass."""
+    """Learning of a cell, beside floors and what nobody can pass, and an episode of its best."""
     env = runs[0].algorithm.env
     kind, bound = tmaze.ceiling(env)
-    return learned(name, runs, EPISODES, "score", 4) | {
+    found = learned(name, runs, EPISODES, "score", 4)
+    best = int(np.argmax(found["final"]))
+    return found | {
         "floors": {name: round(share, 4) for name, share in floors(env).items()},
         "ceiling": [kind, round(bound, 4)],
+        "episode": episode(best, env, runs[best].champion),
     }
+
+
+def episode(run: int, env: ExtendedTMaze, champion: Any) -> dict[str, Any] | None:
+    """One episode of a run's champion, trial by trial; None if it has no memory, where all trials
+    are the same. Of a team without what is in its memories: too much for a page."""
+    key = jax.random.key(20_001)
+    if not jax.tree.leaves(champion.start(key=key)):
+        return None
+    trace = maze_trace.trace_maze(env, champion, key=key)
+    left_out = {} if env.robots == 1 else {"memory": None}
+    return {"run": run} | maze_page.plain(env, trace) | left_out
 
 
 def learned(name: str, runs: list[Run], episodes: int, signal: str, digits: int) -> dict[str, Any]:
@@ -159,6 +174,19 @@ def by_place(
             )
         )
     return figures
+
+
+def pictures(measured: dict[str, Any]) -> list[Tracks | HeatMap]:
+    """An episode of the best final champion of each cell that has memory; nothing of results that
+    were measured before there were such pictures."""
+    return [
+        picture
+        for name, cell in measured.items()
+        if cell.get("episode") is not None
+        for picture in maze_page.pictures(
+            f"An episode of {name}, run {cell['episode']['run']}", cell["episode"]
+        )
+    ]
 
 
 def scores(measured: dict[str, Any], published: dict[str, str]) -> Table:

@@ -35,6 +35,7 @@ def sections(measured: dict[str, Any]) -> list[Any]:
     return [
         chapter4.scores(measured, GIVEN),
         *chapter4.curves(measured),
+        *chapter4.pictures(measured),
         chapter4.about(
             "The author trained Converge with undisclosed bonuses for walking together and for "
             "exploring; here the score alone is the fitness. Without memory a robot goes to the "

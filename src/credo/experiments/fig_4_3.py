@@ -35,6 +35,7 @@ def sections(measured: dict[str, Any]) -> list[Any]:
     return [
         chapter4.scores(measured, GIVEN),
         *chapter4.curves(measured),
+        *chapter4.pictures(measured),
         chapter4.about(
             "The dissertation gives 48 % and 33 % for the static robot alone; by its own rules it "
             "observes the reward in 54.2 % and 52.1 % of the trials.",

@@ -36,5 +36,6 @@ def sections(measured: dict[str, Any]) -> list[Any]:
     return [
         chapter4.scores(measured, {}),
         *chapter4.curves(measured),
+        *chapter4.pictures(measured),
         chapter4.about("Every robot has a population of its own."),
     ]

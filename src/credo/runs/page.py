@@ -103,6 +103,69 @@ class HeatMap:
 
 
 @dataclass(frozen=True)
+class Track:
+    """Somebody's row at each column of `Tracks`. `notes`: what the table adds at each column."""
+
+    label: str
+    rows: Sequence[int]
+    notes: Sequence[str] = ()
+    scripted: bool = False  # drawn apart from those that learn
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Who is in which row, column by column, and where the goal is. A table says the same.
+
+    Row 0 is at the top. `goals[columns]`: a row; `reached[columns]`: whether it counts as reached.
+    """
+
+    title: str
+    tracks: Sequence[Track]
+    goals: Sequence[int]
+    reached: Sequence[bool]
+    row_labels: Sequence[str]
+    column_labels: Sequence[str]
+    x_label: str
+    y_label: str
+    goal_label: str = "goal"
+    outcomes: tuple[str, str] = ("reached", "missed")  # of a goal, in words
+    breaks: Sequence[int] = ()  # columns that have a line before them
+    caption: str = ""
+
+    def __post_init__(self):
+        columns, rows = len(self.column_labels), len(self.row_labels)
+        every = [self.reached, self.goals, *(x.rows for x in self.tracks)]
+        lengths = [len(x) for x in (*every, *(x.notes for x in self.tracks if x.notes))]
+        if not self.tracks or columns == 0 or set(lengths) != {columns}:
+            raise ValueError(
+                f"tracks {self.title!r} have {columns} column labels, {len(self.tracks)} tracks "
+                f"and {lengths} outcomes, goals, rows and notes: give at least one track, and of "
+                "everything one for each column"
+            )
+        for place in every[1:]:
+            if not all(0 <= row < rows for row in place):
+                raise ValueError(
+                    f"tracks {self.title!r} have {rows} row labels and somebody or a goal in rows "
+                    f"{list(place)}: each must be in 0..{rows - 1}"
+                )
+
+    @property
+    def table(self) -> "Table":
+        """The same in words, a row for each column of the picture."""
+
+        def note(track: Track, column: int) -> list[str]:
+            return [x for x in track.notes[column : column + 1] if x]
+
+        notes = [self.outcomes[0 if reached else 1] for reached in self.reached]
+        told = [Track(self.goal_label, self.goals, notes), *self.tracks]
+        rows = [
+            [label, *(", ".join([self.row_labels[x.rows[i]], *note(x, i)]) for x in told)]
+            for i, label in enumerate(self.column_labels)
+        ]
+        return Table(self.title, [self.x_label, *(x.label for x in told)], rows)
+
+
+@dataclass(frozen=True)
 class Drawing:
     """A picture of its own: one `<svg>` element for each colouring, whose ids differ."""
 
@@ -137,7 +200,8 @@ class Text:
     paragraphs: Sequence[str]
 
 
-Section = Figure | HeatMap | Drawing | Table | Text
+Drawn = Figure | HeatMap | Tracks | Drawing
+Section = Drawn | Table | Text
 
 
 @dataclass(frozen=True)
@@ -196,8 +260,7 @@ def groups(sections: Sequence[Section]) -> list[tuple[int, list[Section]]]:
     """Neighbouring figures together, everything else alone, each with the index of its first."""
     found: list[tuple[int, list[Section]]] = []
     for index, section in enumerate(sections):
-        drawn = isinstance(section, Figure | HeatMap | Drawing)
-        if drawn and found and isinstance(found[-1][1][0], Figure | HeatMap | Drawing):
+        if isinstance(section, Drawn) and found and isinstance(found[-1][1][0], Drawn):
             found[-1][1].append(section)
         else:
             found.append((index, [section]))
@@ -213,7 +276,7 @@ def render_group(first: int, group: Sequence[Section]) -> str:
     figures = "\n".join(
         render_figure(figure, f"s{first + offset}")
         for offset, figure in enumerate(group)
-        if isinstance(figure, Figure | HeatMap | Drawing)
+        if isinstance(figure, Drawn)
     )
     kind = "figures alone" if len(group) == 1 else "figures"
     return f'<div class="{kind}">\n{figures}\n</div>'
@@ -224,7 +287,7 @@ def render_text(text: Text) -> str:
     return f'<section class="text">{heading(text.title)}{paragraphs}</section>'
 
 
-def render_figure(figure: Figure | HeatMap | Drawing, name: str) -> str:
+def render_figure(figure: Drawn, name: str) -> str:
     """Both colourings of a figure; the style sheet shows one. `name` keeps their ids apart."""
     from . import plots
 
@@ -234,7 +297,8 @@ def render_figure(figure: Figure | HeatMap | Drawing, name: str) -> str:
         light = plots.figure_svg(figure, dark=False, prefix=f"{name}-light-")
         dark = plots.figure_svg(figure, dark=True, prefix=f"{name}-dark-")
         note = plots.note(figure)
-    caption = render_caption(figure.caption, note)
+    table = render_rows(figure.table) if isinstance(figure, Tracks) else ""
+    caption = render_caption(figure.caption, note, table)
     return (
         f'<figure>{heading(figure.title)}<div class="plot">'
         f'<div class="light">{light}</div><div class="dark">{dark}</div></div>'
@@ -243,6 +307,14 @@ def render_figure(figure: Figure | HeatMap | Drawing, name: str) -> str:
 
 
 def render_table(table: Table) -> str:
+    # The box may end between two rows, and then shows no sign of the rest.
+    count = f"{len(table.rows)} rows, in a box that scrolls." if len(table.rows) > 12 else ""
+    caption = render_caption(table.caption, count)
+    return f'<figure class="table">{heading(table.title)}{render_rows(table)}{caption}</figure>'
+
+
+def render_rows(table: Table) -> str:
+    """The table in a box that scrolls, without its title."""
     numeric = [
         any(is_number(cell) for cell in column)
         and all(cell is None or is_number(cell) for cell in column)
@@ -258,15 +330,10 @@ def render_table(table: Table) -> str:
         + "</tr>\n"
         for row in table.rows
     )
-    # The box may end between two rows, and then shows no sign of the rest.
-    count = f"{len(table.rows)} rows, in a box that scrolls." if len(table.rows) > 12 else ""
-    caption = render_caption(table.caption, count)
     return (
-        f'<figure class="table">{heading(table.title)}'
         # Focusable, so that a keyboard can scroll it.
         f'<div class="scroll" role="region" tabindex="0" aria-label="{escape(table.title)}">'
         f"<table><thead><tr>{header}</tr></thead><tbody>\n{rows}</tbody></table></div>"
-        f"{caption}</figure>"
     )
 
 
@@ -301,9 +368,11 @@ def cell_text(cell: Cell) -> str:
     return text.replace("-", "−")
 
 
-def render_caption(caption: str, note: str) -> str:
+def render_caption(caption: str, note: str, table: str = "") -> str:
+    """The text below a figure, and in it a table that opens."""
+    table = table and f"<details><summary>As a table</summary>{table}</details>"
     note = f'<span class="note">{escape(note)}</span>' if note else ""
-    text = " ".join(filter(None, [escape(caption), note]))
+    text = " ".join(filter(None, [escape(caption), note, table]))
     return f"<figcaption>{text}</figcaption>" if text else ""
 
 
@@ -352,6 +421,9 @@ code span { white-space: nowrap; }
 .figures { display: grid; gap: 2.75rem 2.5rem; grid-template-columns: minmax(0, 1fr); }
 figcaption { margin-top: .6rem; font-size: .9rem; line-height: 1.5; max-width: 44rem; }
 .note { color: var(--muted); }
+details { margin-top: .4rem; }
+summary { width: fit-content; color: var(--muted); cursor: pointer; }
+details .scroll { margin-top: .5rem; }
 .plot { max-width: 36rem; }
 .plot svg { display: block; width: 100%; height: auto; overflow: visible; }
 .dark { display: none; }

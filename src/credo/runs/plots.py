@@ -1,4 +1,4 @@
-"""Figures and heat maps of a page drawn with matplotlib: SVG for the page, PNG for the rest."""
+"""Figures of a page drawn with matplotlib: SVG for the page, PNG for the rest."""
 
 import io
 import math
@@ -14,25 +14,30 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 from matplotlib.text import Text as Words
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from ..analysis.statistics import bootstrap_interval
-from .page import Curve, Figure, HeatMap, Reference
+from .page import Curve, Figure, HeatMap, Reference, Tracks
 
 Floats = NDArray[np.float64]
+Plot = Figure | HeatMap | Tracks
 
 WIDTH, HEIGHT = 4.8, 3.1  # inches, without the legend
 MOST_POINTS = 400  # drawn per line
 MOST_SEED_POINTS = 24_000  # drawn per figure by the lines of single seeds
 FONT = "system-ui,-apple-system,'Segoe UI',Roboto,'Helvetica Neue',Arial,'DejaVu Sans',sans-serif"
+MARKERS = ("o", "^", "D", "v", "p", "P")  # of tracks
+WALKERS, GOAL = (0, 2, 3, 1, 5), 4  # their colours, and that of their goal, of a theme's curves
 DASHES = ((1, 0), (5, 1.6), (1.3, 1.3), (6, 1.5, 1.3, 1.5))
 
 # `hashsalt` makes the same figure the same text; `parse_math` keeps a $ in a label a $.
@@ -91,7 +96,7 @@ DARK = Theme(
 )
 
 
-def figure_svg(figure: Figure | HeatMap, dark: bool = False, *, prefix: str = "") -> str:
+def figure_svg(figure: Plot, dark: bool = False, *, prefix: str = "") -> str:
     """The figure, without its title, as an `<svg>` element that scales with its box.
 
     Text stays text. Every id begins with `prefix`: several figures in one page need different
@@ -104,7 +109,7 @@ def figure_svg(figure: Figure | HeatMap, dark: bool = False, *, prefix: str = ""
 
 
 def save_png(
-    figure: Figure | HeatMap, path: str | os.PathLike[str], dark: bool = False, *, dpi: int = 200
+    figure: Plot, path: str | os.PathLike[str], dark: bool = False, *, dpi: int = 200
 ) -> Path:
     """Write the figure with its title to `path`; 960 pixels wide at 200 dpi."""
     theme = DARK if dark else LIGHT
@@ -116,11 +121,13 @@ def save_png(
     return Path(path)
 
 
-def note(figure: Figure | HeatMap) -> str:
+def note(figure: Plot) -> str:
     """How to read the figure: what its lines, bands and colours stand for."""
     if isinstance(figure, HeatMap):
         missing = not np.isfinite(np.asarray(figure.values, dtype=np.float64)).all()
         return "Grey: no value." if missing else ""
+    if isinstance(figure, Tracks):
+        return ""  # its legend says all
     seeds = sorted({np.shape(curve.runs)[0] for curve in figure.curves})
     count = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]}–{seeds[-1]}"
     parts = ["One seed per line."]
@@ -135,13 +142,19 @@ def note(figure: Figure | HeatMap) -> str:
     return " ".join(parts)
 
 
-def description(figure: Figure | HeatMap) -> str:
+def description(figure: Plot) -> str:
     """One sentence for those who cannot see the figure."""
     what = f"{figure.title}: " if figure.title else ""
     if isinstance(figure, HeatMap):
         rows, columns = np.shape(figure.values)
         return (
             f"{what}heat map, {rows} rows ({figure.y_label}), {columns} columns ({figure.x_label})"
+        )
+    if isinstance(figure, Tracks):
+        who, (good, _) = ", ".join(track.label for track in figure.tracks), figure.outcomes
+        return (
+            f"{what}{figure.y_label} of {who} against {figure.x_label}; {figure.goal_label} {good} "
+            f"in {sum(bool(x) for x in figure.reached)} of {len(figure.reached)}"
         )
     curves = ", ".join(curve.label for curve in figure.curves)
     levels = ", ".join(f"{line.label} at {line.value:.4g}" for line in figure.references)
@@ -179,7 +192,7 @@ def short_path(path: re.Match[str]) -> str:
     return re.sub(r"\s*\n\s*|(?<=[A-Za-z]) ", "", rounded.replace(".0", ""))
 
 
-def draw(figure: Figure | HeatMap, theme: Theme) -> Canvas:
+def draw(figure: Plot, theme: Theme) -> Canvas:
     """The figure on a canvas of its own, with no title."""
     canvas = Canvas(figsize=(WIDTH, HEIGHT), layout="constrained")
     FigureCanvasAgg(canvas)  # measures text; saving as SVG brings its own
@@ -191,6 +204,8 @@ def draw(figure: Figure | HeatMap, theme: Theme) -> Canvas:
     axes.set_ylabel(textwrap.fill(figure.y_label, 34), color=theme.ink)
     if isinstance(figure, HeatMap):
         draw_heat_map(canvas, axes, figure, theme)
+    elif isinstance(figure, Tracks):
+        draw_tracks(canvas, axes, figure, theme)
     else:
         draw_curves(canvas, axes, figure, theme)
     return canvas
@@ -291,7 +306,7 @@ def short_number(value: float) -> str:
     return f"{value:g}".replace("-", "−")
 
 
-def add_legend(canvas: Canvas, handles: Sequence[Line2D], theme: Theme) -> None:
+def add_legend(canvas: Canvas, handles: Sequence[Artist], theme: Theme) -> None:
     """A legend below the axes, in as many columns as fit; the canvas grows by its height."""
     if not handles:
         return
@@ -310,7 +325,7 @@ def add_legend(canvas: Canvas, handles: Sequence[Line2D], theme: Theme) -> None:
         )
         extent = legend.get_window_extent()
         if columns == 1 or extent.width <= 0.96 * canvas.bbox.width:
-            canvas.set_size_inches(WIDTH, HEIGHT + extent.height / canvas.dpi)
+            canvas.set_figheight(canvas.get_figheight() + extent.height / canvas.dpi)
             return
         legend.remove()
 
@@ -387,6 +402,66 @@ def draw_heat_map(canvas: Canvas, axes: Axes, figure: HeatMap, theme: Theme) -> 
     label_cells(canvas, axes, figure, height)
 
 
+def draw_tracks(canvas: Canvas, axes: Axes, figure: Tracks, theme: Theme) -> None:
+    rows, columns = len(figure.row_labels), len(figure.column_labels)
+    cell = 3.9 / columns  # inches; about what the axes have
+    height = float(np.clip(rows * max(cell, 0.24), 1.3, 4.0))
+    canvas.set_size_inches(WIDTH, height + 0.6)
+    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
+    axes.spines[:].set(visible=True, color=theme.grid)
+    axes.set_xticks(np.arange(0.5, columns - 1), minor=True)
+    axes.set_yticks(np.arange(0.5, rows - 1), minor=True)
+    axes.tick_params(which="minor", length=0)
+    axes.grid(which="minor", color=theme.grid, linewidth=0.7)
+    axes.set_axisbelow(True)
+    for at in figure.breaks:
+        axes.axvline(at - 0.5, color=theme.ink, linewidth=1.2, zorder=2.5)
+    # Everybody has a place of their own in a cell: who are in one cell do not hide each other.
+    n = len(figure.tracks)
+    room = {wide: min(cell / wide, height / rows / -(-n // wide)) for wide in range(n, 0, -1)}
+    wide = max(room, key=room.__getitem__)
+    high = -(-n // wide)
+    size = min(0.8 * 72 * room[wide], 9.0)
+    handles, learners = draw_goals(axes, figure, theme), 0
+    for i, track in enumerate(figure.tracks):
+        x = np.arange(columns) + (i % wide + 0.5) / wide - 0.5
+        y = np.asarray(track.rows) + (i // wide + 0.5) / high - 0.5
+        marker, color = "X", theme.ink
+        if not track.scripted:
+            marker = MARKERS[learners % len(MARKERS)]
+            color = theme.curves[WALKERS[learners % len(WALKERS)]]
+            learners += 1
+        look: dict[str, Any] = {"marker": marker, "color": color, "mec": theme.page}
+        axes.plot(x, y, **look, lw=0.8, alpha=0.3, ms=0, zorder=3)
+        axes.plot(x, y, **look, lw=0, ms=size, mew=0.12 * size, zorder=4)
+        label = textwrap.fill(track.label, 56)
+        handles.append(Line2D([], [], **look, lw=0, ms=7, mew=0.7, label=label))
+    label_cells(canvas, axes, figure, height)
+    add_legend(canvas, handles, theme)
+
+
+def draw_goals(axes: Axes, figure: Tracks, theme: Theme) -> list[Artist]:
+    """The goal of each column as a square, filled and in a coloured column where it was reached;
+    and what stands for both in the legend."""
+    gold = theme.curves[GOAL]
+    labels = (f"{figure.goal_label}, {outcome}" for outcome in figure.outcomes)
+    # Of full colour or dashed as well: not everybody tells colours apart.
+    looks: dict[bool, dict[str, Any]] = {
+        True: {"fc": gold, "ec": gold, "alpha": 0.75, "lw": 0},
+        False: {"fc": theme.grid, "ec": theme.muted, "ls": (0, (2, 1.5)), "lw": 0.8},
+    }
+    for x, (row, reached) in enumerate(zip(figure.goals, figure.reached, strict=True)):
+        if reached:
+            column = (x - 0.5, -0.5), 1, len(figure.row_labels)
+            axes.add_patch(Rectangle(*column, fc=gold, alpha=0.16, lw=0, zorder=1))
+        square = (x - 0.46, row - 0.46), 0.92, 0.92
+        axes.add_patch(Rectangle(*square, **looks[bool(reached)], zorder=2))
+    return [
+        Rectangle((0, 0), 1, 1, **looks[reached], label=textwrap.fill(label, 56))
+        for reached, label in zip((True, False), labels, strict=True)
+    ]
+
+
 def color_scale(values: Floats, theme: Theme) -> tuple[Colormap, float, float]:
     """From the page's own colour to a strong one; values of both signs meet at zero."""
     present = values[~np.isnan(values)]
@@ -403,7 +478,7 @@ def color_scale(values: Floats, theme: Theme) -> tuple[Colormap, float, float]:
     return colors, float(low), float(high)
 
 
-def label_cells(canvas: Canvas, axes: Axes, figure: HeatMap, height: float) -> None:
+def label_cells(canvas: Canvas, axes: Axes, figure: HeatMap | Tracks, height: float) -> None:
     """As many row and column labels as are readable: all, turned, or every n-th."""
     rows, columns = len(figure.row_labels), len(figure.column_labels)
     every = nice_step(rows * 0.17 / height)

@@ -1,4 +1,4 @@
-"""What `credo watch` makes: a film of a champion, or a page that plays in the browser."""
+"""What `credo watch` makes: a film of a champion, a page that plays in the browser, or pictures."""
 
 import contextlib
 import importlib.util
@@ -18,11 +18,12 @@ import numpy as np
 
 from .. import require
 from ..environments import worker
+from ..environments.extended_tmaze import ExtendedTMaze
 from ..environments.gymnasium import Gymnasium
 from ..environments.host import AbstractHostEnvironment
 from ..environments.rover import Rover
 from ..environments.wrappers import DelayedHostReward, DelayedReward
-from . import replay_page
+from . import maze_page, replay_page
 from .loop import Policy, Run, RunError
 
 FASTEST = 50  # pictures per second: browsers slow a gif down that has more
@@ -40,18 +41,19 @@ def watch(
     size: tuple[int, int] = (480, 480),
 ) -> pathlib.Path:
     """Show episodes of a run's champion, without a window: on a Gymnasium task or with rovers as a
-    film, with rovers also as a page that plays in the browser.
+    film, with rovers also as a page that plays in the browser, in a T-maze as a page of pictures.
 
     A Gymnasium environment is made in this process.
 
     **Arguments:**
 
-    - `output`: a file that ends in .gif, in .mp4, which needs the extra `credo[video]`, or with
-      rovers in .html; None: `champion.html` in the run's folder with rovers, else `champion.gif`.
+    - `output`: a file that ends in .gif, in .mp4, which needs the extra `credo[video]`, with
+      rovers also in .html, and of a T-maze in .html alone; None: `champion.html` in the run's
+      folder with rovers and of a T-maze, else `champion.gif`.
     - `episodes`: one after the other, with seeds `seed`, `seed` + 1, …
     - `fps`: environment steps shown per second; None: in real time, as far as the environment
       tells, and 5 with rovers. Above 50 a film leaves some steps out. The speed of a page can be
-      changed in the page.
+      changed in the page. Of a T-maze nothing moves.
     - `size`: width and height of a film in pixels, where the environment lets us choose (MuJoCo's
       and rovers do).
 
@@ -65,10 +67,13 @@ def watch(
     if fps is not None and not 0 < fps < math.inf:
         raise ValueError(f"fps is {fps}: it must be more than 0")
     env = run.algorithm.env
-    rovers, task = rover_task(env), gymnasium_task(env)
-    default = run.path / ("champion.html" if rovers is not None else "champion.gif")
+    rovers, maze, task = rover_task(env), maze_task(env), gymnasium_task(env)
+    paged = rovers is not None or maze is not None
+    default = run.path / ("champion.html" if paged else "champion.gif")
     output = default if output is None else pathlib.Path(output)
     seeds = range(seed, seed + episodes)
+    if maze is not None:
+        return _show_maze(run, maze, output, seeds)
     if rovers is not None:
         return _watch_rovers(run, rovers, output, seeds, fps or ROVER_STEPS, size)
     write = _writer(output)
@@ -105,6 +110,12 @@ def _watch_rovers(
     return _film(write, output, pictures, rate / stride)
 
 
+def _show_maze(run: Run, env: ExtendedTMaze, output: pathlib.Path, seeds: range) -> pathlib.Path:
+    if output.suffix.lower() != ".html":
+        raise ValueError(f"the output is to be {str(output)!r}: of a T-maze it must end in .html")
+    return maze_page.write(env, run.champion, seeds, output, title=f"Credo: {run.path.name}")
+
+
 def _film(
     write: "Writer", output: pathlib.Path, pictures: Iterator[np.ndarray], rate: float
 ) -> pathlib.Path:
@@ -124,6 +135,13 @@ def rover_task(env: Any) -> Rover | None:
     while isinstance(env, DelayedReward):
         env = env.env
     return env if isinstance(env, Rover) else None
+
+
+def maze_task(env: Any) -> ExtendedTMaze | None:
+    """The T-maze itself, without what pays its rewards later; None if it is another task."""
+    while isinstance(env, DelayedReward):
+        env = env.env
+    return env if isinstance(env, ExtendedTMaze) else None
 
 
 def gymnasium_task(env: Any) -> Gymnasium | None:
@@ -154,7 +172,8 @@ def opened(task: Gymnasium, **kwargs: Any) -> Iterator[worker.Environments]:
 
 def _nothing_to_see(run: Run) -> str:
     env = run.algorithm.env
-    name, seen = type(env).__name__, "what can be watched are rovers and tasks of Gymnasium"
+    name = type(env).__name__
+    seen = "what can be watched are rovers, T-mazes and tasks of Gymnasium"
     if isinstance(env, AbstractHostEnvironment):
         return f"{name} cannot be drawn: {seen}"
     return (
