@@ -487,13 +487,24 @@ def test_spread_returns_are_equal_parts_of_what_was_paid(env):
     np.testing.assert_array_equal(spread.transitions.obs, experience.transitions.obs)
 
 
+class Started(Slow):
+    """Acts by chance too: its start is drawn."""
+
+    def start(self, *, key):
+        return jax.random.normal(key), self.inner.start(key=key)
+
+    def __call__(self, obs, carry):
+        action, inner = self.inner(obs, carry[1])
+        return action + carry[0], (carry[0], inner)
+
+
 @pytest.mark.parametrize("common", [True, False])
 def test_large_policies_play_in_turn_what_they_play_together(common, monkeypatch):
-    population = population_of(Copy(), MLP(hidden=(3,)))
-    key = jax.random.key(3)
+    population = eqx.filter_vmap(Started)(population_of(Copy(), MLP(hidden=(3,))))
+    key, weights = jax.random.key(3), 3 * Copy().obs_size + 3 + 3 + 1
     together = rollout.evaluate(Copy(), population, EPISODES, common=common, key=key)
-    monkeypatch.setattr(tree, "CACHED", 1)
+    monkeypatch.setattr(tree, "CACHED", 2 * weights)
+    assert tree.batch(population) == 2  # of three
     apart = rollout.evaluate(Copy(), population, EPISODES, common=common, key=key)
-    same = np.allclose(apart.returns["reward"], together.returns["reward"], atol=1e-5)
-    assert same == common  # worlds of one's own are drawn in another order
-    assert np.unique(np.asarray(apart.returns["reward"])).size == POP * EPISODES
+    np.testing.assert_allclose(apart.returns["reward"], together.returns["reward"], atol=1e-5)
+    assert np.unique(np.asarray(apart.returns["reward"])).size >= POP * EPISODES - 2  # some are cut

@@ -55,10 +55,9 @@ def evaluate(
         return _play_on_host(env, population, episodes, episodes, common, False, key=key)[0]
     if isinstance(env, AbstractSequenceTask) and getattr(population, "features_first", False):
         return _answer(env, population, episodes, common, key=key)
-    if tree.batch(population) < tree.size(population):
-        return _play_in_turn(env, population, episodes, common, key=key)
-    keys = jax.random.split(key)
-    return _play(env, population, episodes, jnp.int32(episodes), common, False, keys)[0]
+    lanes = _lanes(population, episodes, common, key=key)
+    play = _play_in_turn if tree.batch(population) < tree.size(population) else _play
+    return play(env, lanes, jnp.int32(episodes), False)[0]
 
 
 def collect(
@@ -79,8 +78,7 @@ def collect(
     wanted = episodes if wanted is None else wanted
     if isinstance(env, AbstractHostEnvironment):
         return _play_on_host(env, population, episodes, wanted, common, True, key=key)
-    keys = jax.random.split(key)
-    return _play(env, population, episodes, jnp.int32(wanted), common, True, keys)
+    return _play(env, _lanes(population, episodes, common, key=key), jnp.int32(wanted), True)
 
 
 def score(
@@ -113,6 +111,14 @@ def world_keys(pop: int, episodes: int, common: bool, *, key: PRNGKeyArray) -> P
 
 
 @jit
+def _lanes(population: PyTree, episodes: int, common: bool, *, key: PRNGKeyArray) -> PyTree:
+    """Policies, and for each episode of each the key of its world and that of the policy."""
+    world_key, policy_key = jax.random.split(key)
+    worlds = world_keys(tree.size(population), episodes, common, key=world_key)
+    return population, worlds, jax.random.split(policy_key, worlds.shape)
+
+
+@jit
 def _answer(
     env: AbstractSequenceTask, population: PyTree, episodes: int, common: bool, *, key: PRNGKeyArray
 ) -> Evaluation:
@@ -125,41 +131,26 @@ def _answer(
 
 
 @jit
-def _play_in_turn(
-    env: AbstractEnvironment, population: PyTree, episodes: int, common: bool, *, key: PRNGKeyArray
-) -> Evaluation:
+def _play_in_turn(env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: bool):
     """Large policies some at a time: their weights stay in the cache from step to step."""
-    world_key, policy_key = jax.random.split(key)
-
-    def play(given):
-        some, keys = given
-        pair = jnp.stack([world_key if common else keys[0, 0], keys[0, 1]])
-        return _play(env, some, episodes, jnp.int32(episodes), common, False, pair)[0]
-
-    keys = jax.random.split(policy_key, (tree.size(population), 2))
-    return tree.in_batches(play, (population, keys))
+    return tree.in_batches(lambda some: _play(env, some, wanted, record), lanes)
 
 
 @jit
 def _play(
-    env: AbstractEnvironment,
-    population: PyTree,
-    episodes: int,
-    wanted: Int[Array, ""],
-    common: bool,
-    record: bool,
-    keys: PRNGKeyArray,
+    env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: bool
 ) -> tuple[Evaluation, Any]:
     """All lanes `[pop, episodes]` take each step together, so that a row of the buffer is written
-    in place; a `vmap` of whole episodes would copy the buffer at every step. `keys`: of worlds and
-    of policies. `record`: the second result is the `Experience`, not None."""
-    (world_key, policy_key), lanes = keys, (tree.size(population), episodes)
-    worlds = world_keys(*lanes, common, key=world_key)
+    in place; a `vmap` of whole episodes would copy the buffer at every step. `lanes`: policies
+    `[pop]`, keys of worlds and of policies. `record`: the second result is the `Experience`, not
+    None."""
+    population, worlds, policy_keys = lanes
+    lanes = worlds.shape
     reset_keys, step_keys = jnp.moveaxis(_each(jax.random.split)(worlds), 2, 0)
     states, first = _each(lambda key: env.reset(key=key))(reset_keys)
     population = eqx.filter_vmap(lambda policy: policy.arranged())(population)
-    carries = _start(population, jax.random.split(policy_key, lanes))
-    active = jnp.broadcast_to(jnp.arange(episodes) < wanted, lanes)
+    carries = _start(population, policy_keys)
+    active = jnp.broadcast_to(jnp.arange(lanes[1]) < wanted, lanes)
     # Where policy or world said NaN the episode goes on, has a return of NaN, and is forgotten.
     lost = active & ~_sound(first.obs)
     totals = (jax.tree.map(jnp.zeros_like, first.rewards), jnp.zeros(lanes, jnp.int32), lost)

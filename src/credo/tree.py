@@ -1,6 +1,7 @@
 """A population is a pytree whose array leaves carry a leading axis `[pop]`."""
 
 import itertools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -83,14 +84,16 @@ def packing(population: PyTree) -> tuple[Callable[[PyTree], PyTree], Callable[[P
 
 
 def batch(members: PyTree) -> int:
-    """How many members have their weights in the cache of a core together; divides their number."""
+    """How many members have their weights in the cache of a core together: all of them elsewhere
+    than on a CPU."""
     n, weights = size(members), jax.tree.leaves(eqx.filter(members, eqx.is_inexact_array))
     fit = max(CACHED * n // max(sum(x.size for x in weights), 1), 1)
-    return max(d for d in range(1, min(n, fit) + 1) if n % d == 0)
+    return n if jax.default_backend() != "cpu" else math.ceil(n / math.ceil(n / fit))
 
 
 def in_batches(function: Callable[[PyTree], PyTree], members: PyTree) -> PyTree:
-    """`function` of a population, called for one `batch` after the other.
+    """`function` of a population, which must treat every member alike, called for one `batch` after
+    the other; under `vmap` for one of each population.
 
     Large genomes would go through memory once per operation; and XLA would merge what is done to
     all of them into few programs that take minutes to compile.
@@ -98,10 +101,12 @@ def in_batches(function: Callable[[PyTree], PyTree], members: PyTree) -> PyTree:
     n, some = size(members), batch(members)
     if some == n:
         return function(members)
+    if n % some:  # the last one again fills the last batch
+        members = take(members, jnp.minimum(jnp.arange(math.ceil(n / some) * some), n - 1))
     arrays, rest = eqx.partition(members, eqx.is_array)
     split = jax.tree.map(lambda x: x.reshape(-1, some, *x.shape[1:]), arrays)
     done = jax.lax.map(lambda x: function(eqx.combine(x, rest)), split)
-    return jax.tree.map(lambda x: x.reshape(n, *x.shape[2:]), done)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], done)
 
 
 class Layout(eqx.Module):

@@ -36,6 +36,9 @@ def test_without_partners_an_individual_plays_the_simulations_of_all_its_teams()
     assert (alone.agents, alone.simulations) == (1, 3 * 7)
     np.testing.assert_array_equal(alone.drawn(key=jax.random.key(0)), [[0, 1, 2, 3, 4, 5]])
     assert SMALL.simulations == 2
+    _, metrics = alone.generation(alone.init(key=jax.random.key(0)), key=jax.random.key(1))
+    assert float(metrics["frames"]) == 6 * 21 * alone.env.max_steps
+    assert float(metrics["fitness_nan"]) == 0
 
 
 def test_fitness_is_the_mean_or_best_over_the_teams_of_a_member():

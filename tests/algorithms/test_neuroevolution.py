@@ -442,3 +442,24 @@ def test_a_curriculum_may_train_on_a_longer_task_and_tests_on_the_algorithms_own
 def test_impossible_settings_are_refused(fields, told):
     with pytest.raises(ValueError, match=told):
         Neuroevolution(Copy(), MMU(hidden=2), **fields)
+
+
+def test_large_genomes_are_bred_in_batches_as_they_are_together(monkeypatch):
+    fleet = Neuroevolution.dmmu(
+        ServerFleet.case_study(),
+        DMMU(hidden=2),
+        population_size=8,
+        elite_fraction=0.13,
+        crossover=MaskedCrossover(),
+        crossover_probability=0.5,
+        mating=(OnePointCrossover(probability=0.5), AgentCrossover(probability=0.5)),
+    )
+    population, fitness = fleet.new_population(key=KEY), jnp.arange(8.0)
+    # Compiled under other names: what fits into a cache is read while a program is made.
+    together = eqx.filter_jit(lambda p: breed(fleet, p, fitness, key=KEY))(population)
+    weights = sum(x[0].size for x in jax.tree.leaves(population))
+    monkeypatch.setattr(tree, "CACHED", 3 * weights)
+    assert tree.batch(population) == 3
+    apart = eqx.filter_jit(lambda p: breed(fleet, p, fitness, key=KEY))(population)
+    for a, b in zip(jax.tree.leaves(apart), jax.tree.leaves(together), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)

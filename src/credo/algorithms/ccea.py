@@ -12,7 +12,8 @@ Departures from the printed box:
   their mean; `assignment="best"` takes the best (Wiegand et al. 2001). With a private signal, such
   as the difference reward, each member is assigned its own.
 - All teams of a generation play in the same worlds. With one population a team is its individual,
-  and its φ teams would repeat each other: it plays φ·z simulations instead, each in another world.
+  and its φ teams would repeat each other: it plays φ·z simulations instead, each in another world,
+  and neither `teaming` nor `assignment` changes anything.
 - The operators are those of Algorithm 2; the author's code drew φ 1 and z 10, and crossed too.
 - Feed-forward networks have their biases mutated; the author's code left those alone.
 """

@@ -37,7 +37,7 @@ QUESTIONS = {  # T-mazes by table
         "spread 2-deep, 4 robots",
     ),
     "Depth 4": ("spread 4-deep, fsp",),
-    "Teams by the cell of their networks": ("spread 2-deep, 2 robots",),
+    "Robots by the cell of their networks": ("converge 2-deep, fsp", "spread 2-deep, 2 robots"),
 }
 
 
@@ -67,15 +67,21 @@ def deep(budget: str) -> list[Cell]:
 
 
 def by_network(budget: str) -> list[Cell]:
-    """Teams of two: MMUs (a cell of Figure 4.4), LSTMs and GRUs."""
-    where, env = "spread 2-deep, 2 robots", _spread(2)
-    mmu = chapter4.cell(f"{where}, mmu", env, "mmu", budget)
-    found = [mmu]
+    """One beside a static robot and teams of two: MMUs (cells of Figures 4.2 and 4.4), LSTMs and
+    GRUs."""
+    tasks = {
+        "converge 2-deep, fsp": ExtendedTMaze(depth=2, objective="converge", partner="fsp"),
+        "spread 2-deep, 2 robots": _spread(2),
+    }
+    found = []
     tiny = budget == "smoke"
-    for kind in ("lstm",) if tiny else ("lstm", "gru"):
-        network = Recurrent(kind, 3 if tiny else 20, "tanh")
-        algorithm = dataclasses.replace(mmu.algorithm, network=network)
-        found.append(dataclasses.replace(mmu, name=f"{where}, {kind}", algorithm=algorithm))
+    for where, env in tasks.items():
+        mmu = chapter4.cell(f"{where}, mmu", env, "mmu", budget)
+        found.append(mmu)
+        for kind in ("lstm",) if tiny else ("lstm", "gru"):
+            network = Recurrent(kind, 3 if tiny else 20, "tanh")
+            algorithm = dataclasses.replace(mmu.algorithm, network=network)
+            found.append(dataclasses.replace(mmu, name=f"{where}, {kind}", algorithm=algorithm))
     return found
 
 
@@ -278,7 +284,8 @@ def costs(changed: dict[str, Any]) -> Table:
     runs = range(len(first["ours"]))
 
     def gain(row: dict[str, Any], who: str) -> str:
-        return f"{row['known'][who][0] - first['known'][who][0]:+.1f}"
+        after, before = row["known"][who], first["known"][who]
+        return _pair((after[0] - before[0], float(np.hypot(after[1], before[1]))), "+")
 
     return Table(
         "Against the first row: what leaving costs and joining brings",
@@ -292,10 +299,13 @@ def costs(changed: dict[str, Any]) -> Table:
             ]
             for name, row in others
         ],
-        caption="Ours: mean ± standard error of the difference, world by world.",
+        caption="Ours: mean ± standard error of the difference, world by world. Script and oracle: "
+        "of the difference of two means.",
     )
 
 
-def _pair(found: Sequence[float], sign: str = "") -> str:
+def _pair(found: Sequence[float | None], sign: str = "") -> str:
     mean, error = found
+    if mean is None:  # a champion that says NaN
+        return "–"
     return f"{mean:{sign}.1f} ± {error:.1f}"

@@ -24,6 +24,8 @@ from .mlp import (
     hidden_layers,
 )
 
+UNROLLED = 16  # so many agents are written out one by one; programs grow with their number
+
 
 class Team(AbstractNetwork):
     """Config of a multi-headed policy.
@@ -86,7 +88,7 @@ class TeamPolicy(AbstractPolicy):
 
     def arranged(self) -> "TeamPolicy":
         heads = tuple(head.arranged() for head in self.heads)
-        if self.config.sharing == "nothing":
+        if self.config.sharing == "nothing" and self.agents <= UNROLLED:
             return TeamPolicy(self.trunks, heads, self.config, self.agents, apart=True)
         rows = (_rows(self.trunks), _rows(heads))
         return TeamPolicy(self.trunks, self.heads, self.config, self.agents, rows)
