@@ -89,7 +89,7 @@ def test_the_best_team_with_memory_is_shown_and_older_results_still_render(runs)
     ((name, cell),) = with_memory.items()
     walk, memory = chapter4.pictures(with_memory)
     best = int(np.argmax(cell["final"]))
-    assert walk.title == f"An episode of {name}, run {best}"
+    assert walk.title == f"An episode of {name}: run {best}, the best of 2"
     assert [len(track.rows) for track in walk.tracks] == [12, 12]
     assert np.shape(memory.values) == (3, 12)
     del cell["episode"]
@@ -251,4 +251,6 @@ def test_what_leaving_costs_stands_beside_what_it_costs_others():
         ["10 servers", "0.5 ± 0.3", "12.0 ± 0.2", "40.0 ± 0.3", "50.0 ± 0.3"],
         ["3 of 10 leave", "0.4 ± 0.3", "10.5 ± 0.2", "34.0 ± 0.3", "45.0 ± 0.3"],
     ]
-    assert beyond_4.costs(changed).rows == [["3 of 10 leave", "-1.5 ± 0.1", "-6.0", "-5.0"]]
+    assert beyond_4.costs(changed).rows == [
+        ["3 of 10 leave", "-1.5 ± 0.1", "-6.0 ± 0.4", "-5.0 ± 0.4"]
+    ]
