@@ -76,6 +76,11 @@ class ServerFleet(AbstractEnvironment):
     counted from 0. None: nobody is ever away."""
     classes: tuple[bool, ...] | None = eqx.field(static=True, default=None)
     """Whether each device is genuine, the same in every episode; None: drawn by `nefarious`."""
+    in_pairs: bool = eqx.field(static=True, default=False)
+    """Episodes played together come in pairs, in whose second the genuine devices of the first are
+    nefarious and the others genuine: a fixed choice of devices then earns exactly 0 and luck is no
+    merit. Each episode alone is as likely as ever; needs as many nefarious at most as genuine at
+    least, as in (7, 13) of 20, and an even number of episodes."""
 
     @classmethod
     def case_study(cls, classes: tuple[bool, ...] | None = None) -> "ServerFleet":
@@ -140,10 +145,20 @@ class ServerFleet(AbstractEnvironment):
     def reset(self, *, key: PRNGKeyArray) -> tuple[FleetState, TimeStep]:
         if self.classes is not None:
             return self.begin(jnp.asarray(self.classes))
+        return self.begin(self._classes(key))
+
+    def _classes(self, key: PRNGKeyArray) -> Bool[Array, " devices"]:
         count_key, order_key = jax.random.split(key)
         low, high = span(self.nefarious)
         count = jax.random.randint(count_key, (), low, high + 1)
-        return self.begin(jax.random.permutation(order_key, self.devices) >= count)
+        return jax.random.permutation(order_key, self.devices) >= count
+
+    def worlds(self, keys: PRNGKeyArray) -> tuple[FleetState, TimeStep]:
+        if not self.in_pairs:
+            return super().worlds(keys)
+        pairs = jax.vmap(self._classes)(keys[::2])
+        genuine = jnp.stack([pairs, ~pairs], axis=1).reshape(-1, self.devices)
+        return jax.vmap(self.begin)(genuine[: keys.shape[0]])
 
     def begin(self, genuine: Bool[Array, " devices"]) -> tuple[FleetState, TimeStep]:
         """An episode with these classes."""

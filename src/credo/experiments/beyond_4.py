@@ -59,7 +59,7 @@ def by_reward(budget: str) -> list[Cell]:
 
 
 def deep(budget: str) -> list[Cell]:
-    env = ExtendedTMaze(depth=4, objective="spread", partner="fsp")
+    env = chapter4.beside("fsp", "spread", 4)
     return [
         chapter4.cell(f"spread 4-deep, fsp, {network}", env, network, budget)
         for network in chapter4.NETWORKS
@@ -70,7 +70,7 @@ def by_network(budget: str) -> list[Cell]:
     """One beside a static robot and teams of two: MMUs (cells of Figures 4.2 and 4.4), LSTMs and
     GRUs."""
     tasks = {
-        "converge 2-deep, fsp": ExtendedTMaze(depth=2, objective="converge", partner="fsp"),
+        "converge 2-deep, fsp": chapter4.beside("fsp", "converge", 2),
         "spread 2-deep, 2 robots": _spread(2),
     }
     found = []

@@ -33,6 +33,8 @@ from .base import (
     to_action,
 )
 
+STARTS = ("drawn", "saturated", "closed", "open")
+
 
 class MMU(AbstractNetwork):
     """Config of an MMU. All sizes are independent once encoder and decoder are learned."""
@@ -48,8 +50,12 @@ class MMU(AbstractNetwork):
     output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
     start_memory: Literal["learned", "zero"] = eqx.field(static=True, default="learned")
     initializer: str = eqx.field(static=True, default="normal")  # normal, fan_in or kaiming
-    start_weights: Literal["drawn", "saturated", "closed"] = eqx.field(static=True, default="drawn")
-    """`closed`: the write gate's bias is lowered by 4, so that memory hardly moves before a gate
+    start_weights: Literal["drawn", "saturated", "closed", "open"] = eqx.field(
+        static=True, default="drawn"
+    )
+    """`open`: the input gate's bias is raised by 3 and weights on memory (N) are drawn a quarter as
+    large, so that inputs move memory from the first step on and memory saturates no gate.
+    `closed`: the write gate's bias is lowered by 4, so that memory hardly moves before a gate
     has learned to open, and gradients reach back through it (compare an LSTM's forget bias).
     `saturated`: at first every gate is open or shut by the input alone, and memory is read but
     not written at distractors. Input weights are drawn 30 times as large, output weights 75 times
@@ -65,7 +71,7 @@ class MMU(AbstractNetwork):
         for name in ("block_activation", "decoder_activation", "encoder_activation"):
             require.choice(name, getattr(self, name), ACTIVATIONS)
         require.choice("output_activation", self.output_activation, ("sigmoid", "tanh"))
-        require.choice("start_weights", self.start_weights, ("drawn", "saturated", "closed"))
+        require.choice("start_weights", self.start_weights, STARTS)
         require.choice("start_memory", self.start_memory, ("learned", "zero"))
         require.choice("initializer", self.initializer, INITIALIZERS)
         if "identity" in (self.encoder, self.decoder) and self.cells != self.hidden:
@@ -95,6 +101,9 @@ class MMU(AbstractNetwork):
         weights: dict[str, Any] = draw(shapes, self.initializer, key=key)
         if self.start_weights == "closed":
             weights["b_w"] = weights["b_w"] - 4.0
+        if self.start_weights == "open":
+            gates = {name: 0.25 * weights[name] for name in ("N_i", "N_p", "N_r", "N_w")}
+            weights |= gates | {"b_i": weights["b_i"] + 3.0}
         if self.start_weights == "saturated":
             scale = {"K": 30.0, "R": 0.1}
             weights = {name: scale.get(name[0], 1.0) * w for name, w in weights.items()}
