@@ -138,6 +138,16 @@ def test_mmu_follows_the_equations(name):
     np.testing.assert_allclose(outputs, raw, atol=2e-5)  # fed back as it is, not as the action
 
 
+def test_an_mmu_may_start_open_to_its_inputs():
+    drawn, opened = (
+        MMU(6, start_weights=start).init(3, 2, key=jax.random.key(0)) for start in ("drawn", "open")
+    )
+    np.testing.assert_allclose(opened.b_i, drawn.b_i + 3.0)
+    for name in ("N_i", "N_p", "N_r", "N_w"):
+        np.testing.assert_allclose(getattr(opened, name), 0.25 * getattr(drawn, name))
+    np.testing.assert_array_equal(opened.K_i, drawn.K_i)
+
+
 def test_mmu_has_one_leaf_per_matrix_of_the_equations():
     net = MMU(hidden=4, memory=2, **BOTH_LEARNED)
     policy = net.init(3, 2, key=jax.random.key(0))

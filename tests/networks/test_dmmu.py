@@ -242,6 +242,8 @@ def test_vmap_equals_single(order):
         ({"order": "any"}, "order is 'any'"),
         ({"access": "nobody"}, "access is 'nobody'"),
         ({"bias_std": -1.0}, "bias_std is -1.0"),
+        ({"start_weights": "open"}, "start_weights is 'open'"),
+        ({"start_weights": "shut", "cell": "lstm"}, "only MMUs have write gates"),
     ],
 )
 def test_wrong_arguments_are_named(given, told):
@@ -300,3 +302,18 @@ def test_a_state_has_one_unit_for_each_memory_cell():
         DMMU(cell="lstm", hidden=2, memory=3)
     with pytest.raises(ValueError, match="cell is 'ntm'"):
         DMMU(cell="ntm")
+
+
+def test_agents_that_start_shut_write_nothing_that_they_are_not_taught_to():
+    drawn, shut = (
+        made(DMMU(hidden=4, initializer="normal", start_weights=start))
+        for start in ("drawn", "shut")
+    )
+    for before, after in zip(drawn.agents, shut.agents, strict=True):
+        np.testing.assert_allclose(after.b_w, before.b_w - 20.0)
+        np.testing.assert_array_equal(after.K_i, before.K_i)
+        for name in ("N_i", "N_p", "N_r", "N_w", "Z_y"):
+            np.testing.assert_allclose(getattr(after, name), 0.2 * getattr(before, name))
+    moved = [np.max(np.abs(play(team, observations())[3])) for team in (drawn, shut)]
+    assert moved[0] > 0.1
+    assert moved[1] < 1e-5

@@ -121,10 +121,11 @@ def fixed_fleet(env: ServerFleet) -> FixedFleet:
 
 def discovering_fleet(env: ServerFleet) -> DiscoveringFleet:
     """The scripted discoverer for `env`; ValueError unless it observes what the script reads."""
-    if env.observation != "signed one-hot" or not env.status:
+    if env.observation != "signed one-hot" or not env.status or env.scale != (1.0, 1.0):
         raise ValueError(
-            f"observation is {env.observation!r} and status is {env.status}: the scripted fleet "
-            "reads ServerFleet(observation='signed one-hot', status=True); the game is the same"
+            f"observation is {env.observation!r}, status is {env.status} and scale is {env.scale}: "
+            "the scripted fleet reads ServerFleet(observation='signed one-hot', status=True, "
+            "scale=(1.0, 1.0)); the game is the same"
         )
     sizes = (env.servers, env.devices, env.requests, env.max_steps)
     chance = jnp.asarray(_chance(env.devices, *span(env.nefarious)), jnp.float32)
@@ -163,7 +164,7 @@ def floors_and_ceilings(
     **Returns:** the floors `random` and `fixed`, then `discovering` (a lower bound on what can be
     reached without knowing the classes) and `oracle` (the ceiling).
     """
-    env = dataclasses.replace(env, observation="signed one-hot", status=True)
+    env = dataclasses.replace(env, observation="signed one-hot", status=True, scale=(1.0, 1.0))
     start_key, play_key = jax.random.split(key)
     states = starts(env, episodes, key=start_key)
     fleets = {

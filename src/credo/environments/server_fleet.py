@@ -71,16 +71,19 @@ class ServerFleet(AbstractEnvironment):
     """How long the worth of a request is observed: one step (as coded; then a server that is busy
     must pay attention to learn it), or until the server acts again."""
     status: bool = eqx.field(static=True, default=True)  # whether it is observed
+    scale: tuple[float, float] = eqx.field(static=True, default=(1.0, 1.0))
+    """What the observed counts, and what a served request was worth, are multiplied by; both more
+    than 0. Raw counts drown the worth: 20 devices with 5 requests each against one ±1."""
     schedule: tuple[tuple[int, int], ...] | None = eqx.field(static=True, default=None)
     """One (joins, leaves) per server: it is away before step `joins` and from step `leaves` on,
     counted from 0. None: nobody is ever away."""
     classes: tuple[bool, ...] | None = eqx.field(static=True, default=None)
     """Whether each device is genuine, the same in every episode; None: drawn by `nefarious`."""
     in_pairs: bool = eqx.field(static=True, default=False)
-    """Episodes played together come in pairs, in whose second the genuine devices of the first are
-    nefarious and the others genuine: a fixed choice of devices then earns exactly 0 and luck is no
-    merit. Each episode alone is as likely as ever; needs as many nefarious at most as genuine at
-    least, as in (7, 13) of 20, and an even number of episodes."""
+    """Episodes that are averaged over come in pairs, in whose second the genuine devices of the
+    first are nefarious and the others genuine: a fixed choice of devices then earns exactly 0, and
+    luck is no merit. Each alone is as likely as ever, for which (least, most) nefarious must be
+    symmetric, as (7, 13) of 20. The last of an odd number is without a partner."""
 
     @classmethod
     def case_study(cls, classes: tuple[bool, ...] | None = None) -> "ServerFleet":
@@ -92,21 +95,32 @@ class ServerFleet(AbstractEnvironment):
             require.at_least(name, getattr(self, name), 1)
         require.choice("observation", self.observation, ("signed one-hot", "scalar"))
         require.choice("told", self.told, ("once", "until-action"))
+        low, high = span(self.busy)
+        if not 0 <= low <= high:
+            raise ValueError(
+                f"busy is {self.busy}: it must be a number of steps of at least 0, or (least, most)"
+            )
         low, high = span(self.nefarious)
         if not 0 <= low <= high <= self.devices:
             raise ValueError(
                 f"nefarious is {self.nefarious}: it must be a number, or (least, most), "
                 f"in 0..{self.devices}, the devices"
             )
-        low, high = span(self.busy)
-        if not 0 <= low <= high:
-            raise ValueError(
-                f"busy is {self.busy}: it must be a number of steps of at least 0, or (least, most)"
-            )
         if self.classes is not None and len(self.classes) != self.devices:
             raise ValueError(
                 f"classes has {len(self.classes)} entries for {self.devices} devices: give True "
                 "(genuine) or False for each"
+            )
+        if len(self.scale) != 2 or not all(x > 0 for x in self.scale):
+            raise ValueError(
+                f"scale is {self.scale}: give (of the counts, of the worth), each more than 0, as "
+                "in (1.0, 1.0)"
+            )
+        if self.in_pairs and (self.classes is not None or low + high != self.devices):
+            raise ValueError(
+                f"in_pairs is set with nefarious {self.nefarious}, {self.devices} devices and "
+                f"classes {self.classes}: genuine and nefarious devices can change places only if "
+                "least + most is the number of devices, and classes is None"
             )
         self._check_schedule()
 
@@ -140,7 +154,8 @@ class ServerFleet(AbstractEnvironment):
 
     @property
     def obs_range(self) -> tuple[float, float]:
-        return -1.0, float(self.requests)
+        counts, worth = self.scale
+        return -max(worth, 1.0), max(counts * self.requests, worth, 1.0)
 
     def reset(self, *, key: PRNGKeyArray) -> tuple[FleetState, TimeStep]:
         if self.classes is not None:
@@ -205,8 +220,9 @@ class ServerFleet(AbstractEnvironment):
     def _time_step(self, state: FleetState, net: Float[Array, ""]) -> TimeStep:
         present = self.present(state.step)
         active = present & (state.busy == 0)
-        pending = jnp.where(active[:, None], state.pending.astype(jnp.float32)[None], 0.0)
-        told = jnp.where(present[:, None], state.told, 0.0)
+        counts, worth = self.scale
+        pending = jnp.where(active[:, None], counts * state.pending.astype(jnp.float32)[None], 0.0)
+        told = jnp.where(present[:, None], worth * state.told, 0.0)
         if self.observation == "scalar":
             told = jnp.sum(told, axis=1, keepdims=True)
         parts = [pending, told]

@@ -63,6 +63,10 @@ class DMMU(AbstractNetwork):
     only who can act. `everyone`: always all; then observations end without a status."""
     initializer: str = eqx.field(static=True, default="fan_in")  # normal, fan_in or kaiming
     bias_std: float = eqx.field(static=True, default=0.1)  # of fresh biases, times that of weights
+    start_weights: Literal["drawn", "shut"] = eqx.field(static=True, default="drawn")
+    """`shut`: of MMUs the write gates' biases are lowered by 20, and weights on memory (N) and to
+    the output (Z_y) are drawn a fifth as large. Else what all agents write at random drowns what an
+    agent is told itself; evolution opens the gates."""
 
     def __check_init__(self):
         sizes = self.hidden if isinstance(self.hidden, tuple) else (self.hidden,)
@@ -80,6 +84,12 @@ class DMMU(AbstractNetwork):
         require.choice("access", self.access, ACCESS)
         require.choice("initializer", self.initializer, INITIALIZERS)
         require.at_least("bias_std", self.bias_std, 0)
+        require.choice("start_weights", self.start_weights, ("drawn", "shut"))
+        if self.start_weights == "shut" and self.cell != "mmu":
+            raise ValueError(
+                f"start_weights is 'shut' and cell is {self.cell!r}: only MMUs have write gates; "
+                "give start_weights='drawn', or cell='mmu'"
+            )
 
     @property
     def cells(self) -> int:
@@ -102,7 +112,8 @@ class DMMU(AbstractNetwork):
 
         def agent(size, key):
             fresh = self._cell(size).init(inputs, action_size, key=key)
-            return jax.tree.map(lambda w: w if w.ndim == 2 else self.bias_std * w, fresh)
+            fresh = jax.tree.map(lambda w: w if w.ndim == 2 else self.bias_std * w, fresh)
+            return _shut(fresh) if self.start_weights == "shut" else fresh
 
         if len(set(sizes)) > 1:
             return DMMUPolicy(tuple(map(agent, sizes, keys)), self)
@@ -266,6 +277,13 @@ class DMMUPolicy(AbstractPolicy):
         # Weights of different sizes are no rows of one array.
         branches = [functools.partial(self._one, agent) for agent in self.agents]
         return lambda i, *seen: jax.lax.switch(i, branches, *seen)
+
+
+def _shut(agent: MMUPolicy) -> MMUPolicy:
+    """The agent before it shares anything."""
+    names = ("N_i", "N_p", "N_r", "N_w", "Z_y")
+    smaller = {name: 0.2 * getattr(agent, name) for name in names}
+    return dataclasses.replace(agent, b_w=agent.b_w - 20.0, **smaller)
 
 
 def _apart(carry: PyTree) -> tuple[Array, Array]:
