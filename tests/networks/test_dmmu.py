@@ -311,9 +311,7 @@ def test_agents_that_start_shut_write_nothing_that_they_are_not_taught_to():
     )
     for before, after in zip(drawn.agents, shut.agents, strict=True):
         np.testing.assert_allclose(after.b_w, before.b_w - 20.0)
-        np.testing.assert_array_equal(after.K_i, before.K_i)
-        for name in ("N_i", "N_p", "N_r", "N_w", "Z_y"):
-            np.testing.assert_allclose(getattr(after, name), 0.2 * getattr(before, name))
+        np.testing.assert_array_equal(after.K_w, before.K_w)
     moved = [np.max(np.abs(play(team, observations())[3])) for team in (drawn, shut)]
     assert moved[0] > 0.1
     assert moved[1] < 1e-5

@@ -210,6 +210,7 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         found.append(
             chapter4_fleet.about(
                 10,
+                chapter4_fleet.GENTLER,
                 "In noise every number that a server observes, but not its status, is told with an "
                 "error N(0, std²) of its own; the curve of a cell in noise is of tests in noise.",
             )

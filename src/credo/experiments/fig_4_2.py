@@ -37,8 +37,9 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         *chapter4.curves(measured),
         *chapter4.pictures(measured),
         chapter4.about(
-            "The author trained Converge with undisclosed bonuses for walking together and for "
-            "exploring; here the score alone is the fitness. Without memory a robot goes to the "
+            "Fitness has the author's undisclosed bonuses: 0.1/T for a trial in which all robots "
+            "took one path, and 0.05/(T-1) for exploring. Tests and tables are of the score alone. "
+            "Without memory a robot goes to the "
             "first endpoint or to the last one, in every trial.",
         ),
     ]

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from ..environments.server_fleet import ServerFleet
 from ..runs.loop import Run
 from . import chapter4_fleet
 from .base import Cell
@@ -30,19 +29,21 @@ TASKS = {"synchronous": 1, "asynchronous": (0, 2)}
 
 def cells(budget: str) -> list[Cell]:
     tiny = budget == "smoke"
-    sizes: dict[str, Any] = {"servers": 2, "devices": 3, "nefarious": 1} if tiny else {}
+    sizes: dict[str, Any] = {"servers": 2, "devices": 4, "nefarious": 2} if tiny else {}
     found = chapter4_fleet.networks(2 if tiny else 30)
     if budget == "full":  # as far as compute goes
         found = {name: found[name] for name in ("dmmu", "lstmne", "ffne")}
+    tasks = {where: chapter4_fleet.large(busy=busy, **sizes) for where, busy in TASKS.items()}
     return [
         chapter4_fleet.cell(
             f"{where}, {name}",
-            ServerFleet(busy=busy, **sizes),
+            env,
             network,
             budget,
             chapter4_fleet.PLANS[budget],
+            mutation=chapter4_fleet.gentle(env, network),
         )
-        for where, busy in TASKS.items()
+        for where, env in tasks.items()
         for name, network in found.items()
     ]
 
@@ -65,6 +66,7 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         *chapter4_fleet.curves(measured),
         chapter4_fleet.about(
             10,
+            chapter4_fleet.GENTLER,
             "The author's generations are 15,000, the budget `published` here. He let several "
             "servers take the last request; here a request is served once.",
         ),

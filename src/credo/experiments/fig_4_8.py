@@ -63,6 +63,7 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         ),
         chapter4_fleet.about(
             table_4_1.EPISODES,
+            chapter4_fleet.STRONGER,
             "Shown is the configuration of the dissertation's text, NGGN, on a linear scale (there "
             "a logarithmic one).",
         ),

@@ -101,6 +101,7 @@ def sections(measured: dict[str, Any]) -> list[Any]:
         every_run(measured),
         chapter4_fleet.about(
             EPISODES,
+            chapter4_fleet.STRONGER,
             "Whoever knows the classes earns 6 in each configuration. A fleet has to find out: "
             f"no fleet earns more than {measured['discoverable']:.3f} on average, the mean of the "
             "published table, 28/6. The script that discovers earns "

@@ -64,9 +64,8 @@ class DMMU(AbstractNetwork):
     initializer: str = eqx.field(static=True, default="fan_in")  # normal, fan_in or kaiming
     bias_std: float = eqx.field(static=True, default=0.1)  # of fresh biases, times that of weights
     start_weights: Literal["drawn", "shut"] = eqx.field(static=True, default="drawn")
-    """`shut`: of MMUs the write gates' biases are lowered by 20, and weights on memory (N) and to
-    the output (Z_y) are drawn a fifth as large. Else what all agents write at random drowns what an
-    agent is told itself; evolution opens the gates."""
+    """`shut`: MMUs' write gates start with biases lowered by 20. Else what all agents write at
+    random drowns what an agent is told itself. Evolution may open them."""
 
     def __check_init__(self):
         sizes = self.hidden if isinstance(self.hidden, tuple) else (self.hidden,)
@@ -113,7 +112,9 @@ class DMMU(AbstractNetwork):
         def agent(size, key):
             fresh = self._cell(size).init(inputs, action_size, key=key)
             fresh = jax.tree.map(lambda w: w if w.ndim == 2 else self.bias_std * w, fresh)
-            return _shut(fresh) if self.start_weights == "shut" else fresh
+            if self.start_weights == "shut":
+                fresh = dataclasses.replace(fresh, b_w=fresh.b_w - 20.0)
+            return fresh
 
         if len(set(sizes)) > 1:
             return DMMUPolicy(tuple(map(agent, sizes, keys)), self)
@@ -277,13 +278,6 @@ class DMMUPolicy(AbstractPolicy):
         # Weights of different sizes are no rows of one array.
         branches = [functools.partial(self._one, agent) for agent in self.agents]
         return lambda i, *seen: jax.lax.switch(i, branches, *seen)
-
-
-def _shut(agent: MMUPolicy) -> MMUPolicy:
-    """The agent before it shares anything."""
-    names = ("N_i", "N_p", "N_r", "N_w", "Z_y")
-    smaller = {name: 0.2 * getattr(agent, name) for name in names}
-    return dataclasses.replace(agent, b_w=agent.b_w - 20.0, **smaller)
 
 
 def _apart(carry: PyTree) -> tuple[Array, Array]:
