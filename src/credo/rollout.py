@@ -147,7 +147,7 @@ def _play(
     population, worlds, policy_keys = lanes
     lanes = worlds.shape
     reset_keys, step_keys = jnp.moveaxis(_each(jax.random.split)(worlds), 2, 0)
-    states, first = jax.vmap(env.worlds)(reset_keys)
+    states, first = _each(lambda key: env.reset(key=key))(reset_keys)
     population = eqx.filter_vmap(lambda policy: policy.arranged())(population)
     carries = _start(population, policy_keys)
     active = jnp.broadcast_to(jnp.arange(lanes[1]) < wanted, lanes)

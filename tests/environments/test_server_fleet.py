@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from credo.analysis.fleet import fixed_fleet, play_fleet
 from credo.environments.checks import check_environment
 from credo.environments.server_fleet import ServerFleet
 
@@ -256,31 +255,13 @@ def test_vmap_equals_single(played):
         ({"observation": "vector"}, "observation is 'vector'"),
         ({"told": "never"}, "told is 'never'"),
         ({"scale": (0.0, 1.0)}, r"scale is \(0.0, 1.0\)"),
-        ({"in_pairs": True, "nefarious": (6, 13)}, r"in_pairs is set with nefarious \(6, 13\)"),
-        ({"in_pairs": True, "classes": (True,) * 20}, "in_pairs is set"),
+        ({"scale": 0.02}, "scale is 0.02"),
+        ({"scale": (float("inf"), 1.0)}, r"scale is \(inf, 1.0\)"),
     ],
 )
 def test_wrong_arguments_are_named(given, told):
     with pytest.raises(ValueError, match=told):
         ServerFleet(**given)
-
-
-def test_in_pairs_the_classes_change_places_and_luck_is_worth_nothing():
-    env = dataclasses.replace(SMALL, busy=1, in_pairs=True)
-    states, _ = env.worlds(jax.random.split(KEY, 2001))
-    genuine = np.asarray(states.genuine)
-    np.testing.assert_array_equal(genuine[1::2], ~genuine[:-1:2])
-    drawn = np.asarray(SMALL.worlds(jax.random.split(KEY, 2001))[0].genuine)
-    for classes in (genuine, drawn):  # each is 1, 2 or 3 of 4, wherever they are
-        counts = np.bincount(classes.sum(axis=1), minlength=5)
-        assert counts[0] == counts[4] == 0
-        np.testing.assert_allclose(counts[1:4] / 2001, 1 / 3, atol=0.05)
-        np.testing.assert_allclose(classes.mean(axis=0), 0.5, atol=0.05)
-
-    fleet = fixed_fleet(env)  # its actions do not depend on what it is told
-    net = np.asarray(play_fleet(env, states, fleet, key=KEY))
-    np.testing.assert_array_equal(net[1::2], -net[:-1:2])
-    assert np.any(net != 0.0)
 
 
 def test_what_is_observed_may_be_scaled():

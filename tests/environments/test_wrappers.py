@@ -1,8 +1,6 @@
 """A shortened task is the whole one up to its n-th question; a delayed one pays at the end; a noisy
 one is the same world, told with errors."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -203,15 +201,6 @@ def test_noise_is_normal_and_of_every_entry_its_own_but_spares_the_status(told):
     # By step, server and entry, of all episodes: no two go together.
     rows = np.corrcoef(noise.reshape(len(noise), -1).T)
     assert np.abs(rows - np.eye(len(rows))).max() < 5.5 / len(noise) ** 0.5
-
-
-@pytest.mark.parametrize("wrapped", [delayed, lambda env: NoisyObservations(env, 0.5, spared=1)])
-def test_pairs_of_episodes_stay_pairs(wrapped):
-    env = dataclasses.replace(FLEET, in_pairs=True, nefarious=2)
-    states, first = wrapped(env).worlds(jax.random.split(jax.random.key(3), 6))
-    genuine = np.asarray(getattr(states, "inner", states).genuine)
-    np.testing.assert_array_equal(genuine[1::2], ~genuine[::2])
-    assert first.obs.shape == (6, *env.reset(key=jax.random.key(0))[1].obs.shape)
 
 
 def test_a_noisy_task_keeps_the_contract():

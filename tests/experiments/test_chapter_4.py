@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from credo.algorithms.ccea import CCEA
+from credo.analysis import fleet
 from credo.environments.server_fleet import ServerFleet
 from credo.environments.wrappers import NoisyObservations
 from credo.experiments import base, beyond_4, chapter4, chapter4_fleet, table_4_1
@@ -60,7 +61,9 @@ def test_cells_have_names_of_their_own_and_the_published_sizes(name):
     for budget in base.budgets(name):
         cells = experiment(name).cells(budget)
         assert len({cell.name for cell in cells}) == len(cells)
-        assert all(cell.first_seed == chapter4.FIRST_SEED for cell in cells)
+        for cell in cells:
+            of = chapter4 if isinstance(cell.algorithm, CCEA) else chapter4_fleet
+            assert cell.first_seed == of.FIRST_SEED
         if budget == "smoke":
             continue
         for cell in cells:
@@ -135,6 +138,27 @@ def test_every_network_of_a_fleet_has_the_same_budget():
     assert busy[6:] == [(0, 2)] * 6
 
 
+def test_a_fleet_that_cannot_write_keeps_its_memory_as_it_begins(runs):
+    cells = {name: runs[name] for name in CHOSEN["fig-4.7"]}
+    measured = experiment("fig-4.7").measure(cells, "smoke")
+    assert [len(cell.get("nobody writes", ())) for cell in measured.values()] == [2, 0]
+    env = ServerFleet(servers=2, devices=4, nefarious=2)
+    team = DMMU(hidden=4, initializer="normal").init(*env.sizes, key=jax.random.key(0))
+    obs = env.reset(key=jax.random.key(1))[1].obs
+    for who, writes in ((team, True), (fleet.without_writing(team), False)):
+        carry = who.start(key=jax.random.key(2))
+        assert bool(np.any(who(obs, carry)[1].memory != carry.memory)) == writes
+
+
+def test_large_fleets_have_few_matrices_hit_whatever_their_network():
+    for cell in experiment("fig-4.7").cells("published"):
+        env, network = cell.algorithm.env, cell.algorithm.network
+        matrices = len(jax.tree.leaves(network.init(*env.sizes, key=jax.random.key(0))))
+        hit = cell.algorithm.mutation.probability * matrices
+        assert hit == pytest.approx(min(3.0, 0.9 * matrices))
+        assert (env.servers, env.devices, env.scale) == (10, 20, (0.02, 1.0))
+
+
 def test_beyond_4_asks_its_questions():
     cells = {cell.name: cell.algorithm for cell in beyond_4.cells("full")}
     for robots in (3, 4):
@@ -148,8 +172,8 @@ def test_beyond_4_asks_its_questions():
     deep = [cells[f"spread 4-deep, fsp, {network}"] for network in chapter4.NETWORKS]
     assert [x.env.depth for x in deep] == [4, 4]
     clear, noisy = cells["synchronous, dmmu"], cells["synchronous, dmmu in noise 0.5"]
-    assert clear.env == ServerFleet()
-    assert noisy.env == NoisyObservations(ServerFleet(), 0.5, spared=1)
+    assert clear.env == chapter4_fleet.large()
+    assert noisy.env == NoisyObservations(clear.env, 0.5, spared=1)
     assert noisy.network == clear.network
 
 

@@ -119,6 +119,12 @@ def fixed_fleet(env: ServerFleet) -> FixedFleet:
     return FixedFleet(env.servers, env.devices)
 
 
+def without_writing(team: DMMUPolicy) -> DMMUPolicy:
+    """A fleet of MMUs whose write gates never open: its memory stays as it begins."""
+    shut = [dataclasses.replace(x, b_w=jnp.full_like(x.b_w, -1e9)) for x in team.members]
+    return team.with_members(tuple(shut))
+
+
 def discovering_fleet(env: ServerFleet) -> DiscoveringFleet:
     """The scripted discoverer for `env`; ValueError unless it observes what the script reads."""
     if env.observation != "signed one-hot" or not env.status or env.scale != (1.0, 1.0):

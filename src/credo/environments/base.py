@@ -5,7 +5,6 @@ import math
 from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
@@ -53,11 +52,6 @@ class AbstractEnvironment(eqx.Module):
     @abc.abstractmethod
     def reset(self, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
         """A fresh episode. The rewards of this first time step are 0."""
-
-    def worlds(self, keys: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
-        """Fresh episodes to be averaged over, `[episodes]` keys. Each is distributed as `reset` has
-        it; a task may draw them so that they are less alike than by chance."""
-        return jax.vmap(lambda key: self.reset(key=key))(keys)
 
     @abc.abstractmethod
     def step(

@@ -11,6 +11,7 @@ Departures from the code:
 - The number of busy steps may be drawn from 0, and an observation ends with the server's status.
 """
 
+import math
 from typing import ClassVar, Literal
 
 import equinox as eqx
@@ -79,11 +80,6 @@ class ServerFleet(AbstractEnvironment):
     counted from 0. None: nobody is ever away."""
     classes: tuple[bool, ...] | None = eqx.field(static=True, default=None)
     """Whether each device is genuine, the same in every episode; None: drawn by `nefarious`."""
-    in_pairs: bool = eqx.field(static=True, default=False)
-    """Episodes that are averaged over come in pairs, in whose second the genuine devices of the
-    first are nefarious and the others genuine: a fixed choice of devices then earns exactly 0, and
-    luck is no merit. Each alone is as likely as ever, for which (least, most) nefarious must be
-    symmetric, as (7, 13) of 20. The last of an odd number is without a partner."""
 
     @classmethod
     def case_study(cls, classes: tuple[bool, ...] | None = None) -> "ServerFleet":
@@ -95,32 +91,27 @@ class ServerFleet(AbstractEnvironment):
             require.at_least(name, getattr(self, name), 1)
         require.choice("observation", self.observation, ("signed one-hot", "scalar"))
         require.choice("told", self.told, ("once", "until-action"))
-        low, high = span(self.busy)
-        if not 0 <= low <= high:
-            raise ValueError(
-                f"busy is {self.busy}: it must be a number of steps of at least 0, or (least, most)"
-            )
         low, high = span(self.nefarious)
         if not 0 <= low <= high <= self.devices:
             raise ValueError(
                 f"nefarious is {self.nefarious}: it must be a number, or (least, most), "
                 f"in 0..{self.devices}, the devices"
             )
+        low, high = span(self.busy)
+        if not 0 <= low <= high:
+            raise ValueError(
+                f"busy is {self.busy}: it must be a number of steps of at least 0, or (least, most)"
+            )
         if self.classes is not None and len(self.classes) != self.devices:
             raise ValueError(
                 f"classes has {len(self.classes)} entries for {self.devices} devices: give True "
                 "(genuine) or False for each"
             )
-        if len(self.scale) != 2 or not all(x > 0 for x in self.scale):
+        two = isinstance(self.scale, tuple) and len(self.scale) == 2
+        if not (two and all(0 < x < math.inf for x in self.scale)):
             raise ValueError(
-                f"scale is {self.scale}: give (of the counts, of the worth), each more than 0, as "
-                "in (1.0, 1.0)"
-            )
-        if self.in_pairs and (self.classes is not None or low + high != self.devices):
-            raise ValueError(
-                f"in_pairs is set with nefarious {self.nefarious}, {self.devices} devices and "
-                f"classes {self.classes}: genuine and nefarious devices can change places only if "
-                "least + most is the number of devices, and classes is None"
+                f"scale is {self.scale}: give a tuple (of the counts, of the worth) of finite "
+                "numbers of more than 0, as in (1.0, 1.0)"
             )
         self._check_schedule()
 
@@ -160,20 +151,10 @@ class ServerFleet(AbstractEnvironment):
     def reset(self, *, key: PRNGKeyArray) -> tuple[FleetState, TimeStep]:
         if self.classes is not None:
             return self.begin(jnp.asarray(self.classes))
-        return self.begin(self._classes(key))
-
-    def _classes(self, key: PRNGKeyArray) -> Bool[Array, " devices"]:
         count_key, order_key = jax.random.split(key)
         low, high = span(self.nefarious)
         count = jax.random.randint(count_key, (), low, high + 1)
-        return jax.random.permutation(order_key, self.devices) >= count
-
-    def worlds(self, keys: PRNGKeyArray) -> tuple[FleetState, TimeStep]:
-        if not self.in_pairs:
-            return super().worlds(keys)
-        pairs = jax.vmap(self._classes)(keys[::2])
-        genuine = jnp.stack([pairs, ~pairs], axis=1).reshape(-1, self.devices)
-        return jax.vmap(self.begin)(genuine[: keys.shape[0]])
+        return self.begin(jax.random.permutation(order_key, self.devices) >= count)
 
     def begin(self, genuine: Bool[Array, " devices"]) -> tuple[FleetState, TimeStep]:
         """An episode with these classes."""

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
-from .. import require, tree
+from .. import require
 from ..types import Sequence, TimeStep
 from .base import AbstractEnvironment, AbstractSequenceTask
 from .host import AbstractCopies, AbstractHostEnvironment, HostStep
@@ -99,13 +99,9 @@ class NoisyObservations(AbstractWrapper):
     # Of `obs_range` the default is left: noise has no bounds.
 
     def reset(self, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
-        state, first = self.worlds(key[None])
-        return tree.take((state, first), 0)
-
-    def worlds(self, keys: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
-        world_keys, noise_keys = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
-        states, first = self.env.worlds(world_keys)
-        return states, jax.vmap(lambda now, key: self._told(now, key=key))(first, noise_keys)
+        world_key, noise_key = jax.random.split(key)
+        state, first = self.env.reset(key=world_key)
+        return state, self._told(first, key=noise_key)
 
     def step(self, state: PyTree, action: Array, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
         world_key, noise_key = jax.random.split(key)
@@ -147,10 +143,6 @@ class DelayedReward(AbstractWrapper):
     def reset(self, *, key: PRNGKeyArray) -> tuple[DelayedState, TimeStep]:
         inner, first = self.env.reset(key=key)
         return DelayedState(inner, first.rewards), first  # they are 0
-
-    def worlds(self, keys: PRNGKeyArray) -> tuple[DelayedState, TimeStep]:
-        inner, first = self.env.worlds(keys)
-        return DelayedState(inner, first.rewards), first
 
     def step(
         self, state: DelayedState, action: Array, *, key: PRNGKeyArray

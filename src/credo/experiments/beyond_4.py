@@ -202,6 +202,7 @@ def sections(measured: dict[str, Any]) -> list[Any]:
             chapter4.about(
                 "`on difference`: the fitness of an individual is its own difference reward; tests "
                 "and tables are of the score.",
+                "Converge is trained on the author's bonuses, as in Figure 4.2.",
                 "LSTMs and GRUs have as many units as an MMU, and the operators that were chosen "
                 "for it.",
             )
@@ -212,7 +213,9 @@ def sections(measured: dict[str, Any]) -> list[Any]:
                 10,
                 chapter4_fleet.GENTLER,
                 "In noise every number that a server observes, but not its status, is told with an "
-                "error N(0, std²) of its own; the curve of a cell in noise is of tests in noise.",
+                "error N(0, std²) of its own, in the units in which it is observed: a request's "
+                "worth is 1 or -1, a count at most 0.1. The curve of a cell in noise is of tests "
+                "in noise.",
             )
         )
     return found

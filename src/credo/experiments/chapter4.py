@@ -57,7 +57,7 @@ OPERATORS: dict[str, Any] = {
     "mutation": author_mutation(limit=40.0, fraction=0.04, reset_probability=0.2),
     "cross_repeated": True,
 }
-FIRST_SEED = 200  # settings were chosen by looking at seeds below
+FIRST_SEED = 300  # settings were chosen by looking at seeds below
 
 
 def cell(name: str, env: ExtendedTMaze, network: str, budget: str, **fields: Any) -> Cell:
@@ -247,10 +247,10 @@ def percent(x: float) -> str:
     return f"{100 * x:.1f}"
 
 
-def spread(x: Any) -> str:
-    """Median and range over runs, in percent."""
-    x = np.asarray(x)
-    return f"{percent(np.median(x))} ({percent(x.min())}…{percent(x.max())})"
+def spread(x: Any, times: float = 100) -> str:
+    """Median and range over runs, as percent or `times` as much."""
+    x = times * np.asarray(x)
+    return f"{np.median(x):.1f} ({x.min():.1f}…{x.max():.1f})"
 
 
 def about(*paragraphs: str) -> Text:
@@ -266,8 +266,8 @@ def about(*paragraphs: str) -> Text:
             "prints 10 % noise and no crossover. Biases are mutated too. MMUs have α 1, a tanh for "
             "φ and no memory at first; their input gates start open, and weights on memory small. "
             "These settings were chosen for the MMU on Converge 2-deep beside FSP, with seeds 0 to "
-            "5 and after a look at 200 to 202 of settings before; nothing was chosen for "
-            "feed-forward networks, which can play two policies only.",
+            "5 and 200 to 202; nothing was chosen for feed-forward networks, which can play two "
+            "policies only.",
             *paragraphs,
         ],
     )

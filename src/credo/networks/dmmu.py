@@ -65,7 +65,8 @@ class DMMU(AbstractNetwork):
     bias_std: float = eqx.field(static=True, default=0.1)  # of fresh biases, times that of weights
     start_weights: Literal["drawn", "shut"] = eqx.field(static=True, default="drawn")
     """`shut`: MMUs' write gates start with biases lowered by 20. Else what all agents write at
-    random drowns what an agent is told itself. Evolution may open them."""
+    random drowns what an agent is told itself. Evolution may open them; an MMU that starts
+    `closed`, by 4, is one for gradients, and with large inputs not shut."""
 
     def __check_init__(self):
         sizes = self.hidden if isinstance(self.hidden, tuple) else (self.hidden,)
