@@ -49,7 +49,7 @@ class Plan(NamedTuple):
 PLANS = {
     "smoke": Plan(5, 2),
     "quick": Plan(200, 2),
-    "full": Plan(1_000, 3),  # curves settle within a few hundred
+    "full": Plan(2_000, 3),
     "published": Plan(10_000, 10),
 }
 OPERATORS: dict[str, Any] = {
