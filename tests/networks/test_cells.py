@@ -145,7 +145,9 @@ def test_an_mmu_may_start_open_to_its_inputs():
     np.testing.assert_allclose(opened.b_i, drawn.b_i + 3.0)
     for name in ("N_i", "N_p", "N_r", "N_w"):
         np.testing.assert_allclose(getattr(opened, name), 0.25 * getattr(drawn, name))
-    np.testing.assert_array_equal(opened.K_i, drawn.K_i)
+    for name in ("K_i", "K_p", "K_r", "K_w"):
+        np.testing.assert_allclose(getattr(opened, name), 3.0 * getattr(drawn, name))
+    np.testing.assert_array_equal(opened.R_i, drawn.R_i)
 
 
 def test_mmu_has_one_leaf_per_matrix_of_the_equations():

@@ -49,15 +49,15 @@ class Plan(NamedTuple):
 PLANS = {
     "smoke": Plan(5, 2),
     "quick": Plan(200, 2),
-    "full": Plan(2_000, 3),
+    "full": Plan(1_000, 3),  # curves settle within 300
     "published": Plan(10_000, 10),
 }
 OPERATORS: dict[str, Any] = {
-    # Of an MMU's 2,000 weights about 50 are hit, not 200 as with the author's 20 %.
-    "mutation": author_mutation(limit=40.0, fraction=0.04, reset_probability=0.2),
+    # Of an MMU's 2,000 weights about 40 are hit, not 200 as with the author's 20 %.
+    "mutation": author_mutation(limit=40.0, fraction=0.03, reset_probability=0.1),
     "cross_repeated": True,
 }
-FIRST_SEED = 300  # settings were chosen by looking at seeds below
+FIRST_SEED = 400  # settings were chosen by looking at seeds below
 
 
 def cell(name: str, env: ExtendedTMaze, network: str, budget: str, **fields: Any) -> Cell:
@@ -261,13 +261,13 @@ def about(*paragraphs: str) -> Text:
             "CCEA (Algorithm 4) with k 100, φ 5, z 7, a test of 15 evaluations per generation; "
             "networks of 20 hidden units. Both kinds of network have the same operators: those of "
             "the author's sequence code (one gate per genome, a part of each matrix hit with 20 % "
-            "noise, repeated survivors crossed), with one entry and up to 4 % of a matrix hit in "
-            "place of 20 %, a fifth of the hits drawn anew, weights clipped to ±40; Algorithm 4 "
+            "noise, repeated survivors crossed), with one entry and up to 3 % of a matrix hit in "
+            "place of 20 %, a tenth of the hits drawn anew, weights clipped to ±40; Algorithm 4 "
             "prints 10 % noise and no crossover. Biases are mutated too. MMUs have α 1, a tanh for "
-            "φ and no memory at first; their input gates start open, and weights on memory small. "
-            "These settings were chosen for the MMU on Converge 2-deep beside FSP, with seeds 0 to "
-            "5 and 200 to 202; nothing was chosen for feed-forward networks, which can play two "
-            "policies only.",
+            "φ and no memory at first; their input gates start open, weights on inputs large and "
+            "on memory small. These settings were chosen for the MMU on Converge 2-deep beside "
+            "FSP, with seeds 0 to 5, 200 to 202 and 300; nothing was chosen for feed-forward "
+            "networks, which can play two policies only.",
             *paragraphs,
         ],
     )

@@ -53,8 +53,9 @@ class MMU(AbstractNetwork):
     start_weights: Literal["drawn", "saturated", "closed", "open"] = eqx.field(
         static=True, default="drawn"
     )
-    """`open`: the input gate's bias is raised by 3 and weights on memory (N) are drawn a quarter as
-    large, so that inputs move memory from the first step on and memory saturates no gate.
+    """`open`: the input gate's bias is raised by 3, and input weights (K) are drawn three times and
+    weights on memory (N) a quarter as large, so that gates follow what is observed and memory
+    saturates none of them.
     `closed`: the write gate's bias is lowered by 4, so that memory hardly moves before a gate
     has learned to open, and gradients reach back through it (compare an LSTM's forget bias).
     `saturated`: at first every gate is open or shut by the input alone, and memory is read but
@@ -102,8 +103,9 @@ class MMU(AbstractNetwork):
         if self.start_weights == "closed":
             weights["b_w"] = weights["b_w"] - 4.0
         if self.start_weights == "open":
-            gates = {name: 0.25 * weights[name] for name in ("N_i", "N_p", "N_r", "N_w")}
-            weights |= gates | {"b_i": weights["b_i"] + 3.0}
+            scale = {"K": 3.0, "N": 0.25}
+            weights = {name: scale.get(name[0], 1.0) * w for name, w in weights.items()}
+            weights["b_i"] = weights["b_i"] + 3.0
         if self.start_weights == "saturated":
             scale = {"K": 30.0, "R": 0.1}
             weights = {name: scale.get(name[0], 1.0) * w for name, w in weights.items()}
