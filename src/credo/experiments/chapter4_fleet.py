@@ -53,7 +53,7 @@ def gentle(env: ServerFleet, network: AbstractNetwork) -> MatrixMutation:
 def large(**fields: Any) -> ServerFleet:
     """The fleet of Figure 4.7. Counts are observed as small numbers: 20 devices with 5 requests
     each would drown the one number that says what a request was worth."""
-    return ServerFleet(**{"scale": (0.02, 1.0)} | fields)
+    return ServerFleet(scale=(0.02, 1.0), **fields)
 
 
 def alone(head: AbstractNetwork) -> Team:
