@@ -49,7 +49,7 @@ class Plan(NamedTuple):
 PLANS = {
     "smoke": Plan(5, 2),
     "quick": Plan(200, 2),
-    "full": Plan(1_000, 3),  # curves settle within 300
+    "full": Plan(1_000, 3),  # Converge has settled; Spread still gains a little
     "published": Plan(10_000, 10),
 }
 OPERATORS: dict[str, Any] = {
