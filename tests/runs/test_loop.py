@@ -161,6 +161,18 @@ def test_a_budget_of_frames_stops_inside_a_dispatch(straight, tmp_path):
     assert loop.Run(run.path).config["budget"] == loop.Run(straight).config["budget"]
 
 
+def test_a_budget_of_generations_has_no_limit_of_frames():
+    """Frames are counted beyond what 32 bits hold."""
+    state = loop._initial(ALGORITHM, jax.random.key(0))
+    seen, budget = 2**31 + 5, loop.Budget(generations=2)
+    state, batch = loop.play(ALGORITHM, state, jax.random.key(0), 0, seen, 2, budget)
+    assert [row["generation"] for row in batch] == [1, 2]
+    assert batch[0]["frames"] > seen
+    budget = loop.Budget(frames=batch[1]["frames"] + 1)
+    _, more = loop.play(ALGORITHM, state, jax.random.key(0), 2, batch[1]["frames"], 2, budget)
+    assert [row["generation"] for row in more] == [3]
+
+
 def test_a_run_of_an_older_version_knows_no_frames_and_no_optax(stopped, straight):
     config = json.loads((stopped / "config.json").read_text())
     del config["budget"]["frames"], config["machine"]["versions"]["optax"]

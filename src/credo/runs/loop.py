@@ -342,7 +342,7 @@ def play(
         columns, count = jax.tree.map(lambda x: np.asarray(x)[None], metrics), 1
     else:
         n = min(n, CHUNK, (budget.generations or MOST) - generation)
-        left = min((budget.frames or MOST) - frames, MOST)
+        left = MOST if budget.frames is None else min(budget.frames - frames, MOST)
         numbers = (np.int32(generation), np.int32(n), np.int32(left), budget.stop_score)
         state, count, metrics = advance((algorithm, root, *numbers), state)
         columns = jax.tree.map(np.asarray, metrics)
