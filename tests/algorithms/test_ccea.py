@@ -9,6 +9,7 @@ from credo import tree
 from credo.algorithms.ccea import CCEA, assigned
 from credo.environments.extended_tmaze import ExtendedTMaze
 from credo.environments.probes import Meet
+from credo.networks.dmmu import DMMU
 from credo.networks.mlp import MLP
 
 SMALL = CCEA(Meet(), MLP(hidden=(4,)), population_size=6, elite_fraction=0.2, teams=3, episodes=2)
@@ -93,6 +94,7 @@ def test_two_populations_learn_to_meet(fitness):
         ({"teams": 0}, "teams is 0: it must be at least 1"),
         ({"fitness": "score"}, "no reward signal 'score': this task has global, local"),
         ({"elite_fraction": 0.001}, "elite_fraction is 0.001 of 100 members"),
+        ({"network": DMMU()}, "DMMU acts for a team, and CCEA evolves a population for each agent"),
     ],
 )
 def test_bad_settings_say_what_is_allowed(fields, told):

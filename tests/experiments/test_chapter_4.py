@@ -109,7 +109,7 @@ def test_shares_of_the_ceiling_are_of_the_median():
             "where": "converge 2-deep, fsp",
             "network": "mmu",
             "final": [0.4, 0.5, 0.45],
-            "floors": {"always left": 0.25, "imitating FSP": 0.2},
+            "floors": {"always left": 0.25, "imitating FSP": 0.5},
             "ceiling": ["optimal", 0.5],
         }
     }
@@ -237,7 +237,7 @@ def test_rewards_networks_and_depths_have_tables_without_a_published_column():
     }
     table = beyond_4.shares("Reward", {"spread 2-deep, 3 robots, mmu on difference": cell})
     assert table.title.startswith("Reward: trials")
-    assert table.columns[2:4] == ["floor: best without learning", "ours, median (range)"]
+    assert table.columns[2:4] == ["floor: best without memory", "ours, median (range)"]
     expected = ["50.0", "75.0 (70.0…80.0)", "93.8 (upper bound)", "80.0"]
     assert table.rows == [["spread 2-deep, 3 robots", "mmu on difference", *expected]]
 

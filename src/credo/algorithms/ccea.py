@@ -70,6 +70,12 @@ class CCEA(eqx.Module):
     fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
 
     def __check_init__(self):
+        if self.network.team:
+            raise ValueError(
+                f"{type(self.network).__name__} acts for a team, and CCEA evolves a population for "
+                "each agent: give a network of one, MMU(...) or MLP(...); teams of one genome are "
+                "evolved by Neuroevolution (credo train neuroevolution --preset dmmu)"
+            )
         require.fits(self.env, Team(head=self.network))
         for name in ("teams", "episodes", "test_episodes"):
             require.at_least(name, getattr(self, name), 1)

@@ -35,6 +35,7 @@ from functools import cache
 
 from ..environments.extended_tmaze import ExtendedTMaze
 
+IMITATING = "imitating FSP"  # the one of the `floors` that needs memory
 EXACT_DEPTH = 2  # to which `optimal` takes seconds
 
 World = tuple[int, int, int]  # where the reward is, where the static robot goes, how it counts
@@ -133,7 +134,7 @@ def floors(env: ExtendedTMaze) -> dict[str, float]:
     if env.partner is not None and env.objective == "spread":
         named["static robot alone"] = static_alone(env)
     if env.partner == "fsp":
-        named["imitating FSP"] = imitating(env)
+        named[IMITATING] = imitating(env)
     return {name: float(share) for name, share in named.items()}
 
 

@@ -12,6 +12,7 @@ Departures from the code:
 """
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import equinox as eqx
@@ -118,16 +119,19 @@ class ServerFleet(AbstractEnvironment):
     def _check_schedule(self):
         if self.schedule is None:
             return
+        if not isinstance(self.schedule, Sequence):
+            raise ValueError(f"schedule is {self.schedule}: give (joins, leaves) for each server")
         if len(self.schedule) != self.servers:
             raise ValueError(
                 f"schedule has {len(self.schedule)} entries for {self.servers} servers: give "
                 "(joins, leaves) for each"
             )
-        for server, (joins, leaves) in enumerate(self.schedule):
-            if not 0 <= joins < leaves:
+        for server, times in enumerate(self.schedule):
+            if len(times) != 2 or not 0 <= times[0] < min(times[1], self.max_steps):
                 raise ValueError(
-                    f"schedule[{server}] is {(joins, leaves)}: it must be (joins, leaves) with "
-                    f"0 <= joins < leaves; (0, {self.max_steps}) is there all the time"
+                    f"schedule[{server}] is {tuple(times)}: it must be (joins, leaves) with "
+                    f"0 <= joins < leaves and joins < {self.max_steps}, the steps of an episode; "
+                    f"(0, {self.max_steps}) is there all the time"
                 )
 
     @property

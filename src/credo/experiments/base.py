@@ -6,6 +6,7 @@ import json
 import pathlib
 import re
 import shlex
+import sys
 from typing import Any, Protocol
 
 import equinox as eqx
@@ -134,6 +135,7 @@ def reproduce(
         jobs,
         title=f"{name} {budget}",
     )
+    print(f"{name} {budget}: runs are done; measuring", file=sys.stderr)
     finished = {name: [Run(path) for path in paths] for name, paths in folder.items()}
     results = {
         "experiment": name,
