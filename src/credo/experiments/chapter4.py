@@ -282,10 +282,11 @@ def about(*paragraphs: str) -> Text:
             "noise, repeated survivors crossed), with one entry and up to 3 % of a matrix hit in "
             "place of 20 %, a tenth of the hits drawn anew, weights clipped to ±40; Algorithm 4 "
             "prints 10 % noise and no crossover. Biases are mutated too. MMUs have α 1, a tanh for "
-            "φ and no memory at first; their input gates start open, weights on inputs large and "
-            "on memory small. These settings were chosen for the MMU on Converge beside FSP, with "
-            "seeds below 500, the start by its first 100 generations at depth 3; nothing was "
-            "chosen for feed-forward networks, which can play two policies only.",
+            "φ and no memory at first; their input and write gates start open, read gates shut, "
+            "weights on inputs large and on memory small. These settings were chosen for the MMU "
+            "on Converge beside FSP, with seeds below 500, the start by its first 100 generations "
+            "at depth 3; nothing was chosen for feed-forward networks, which can play two "
+            "policies only.",
             *paragraphs,
         ],
     )
