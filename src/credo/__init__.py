@@ -37,6 +37,7 @@ _EXPORTS = {
     "Homogenize": "evolution.agents",
     "Mutations": "evolution.mutation",
     "Extinction": "evolution.extinction",
+    "Islands": "evolution.islands",
     "Neuroevolution": "algorithms.neuroevolution",
     "Sequence": "types",
     "TimeStep": "types",

@@ -1,5 +1,7 @@
 """CCEA: who is in which team, what each member is assigned, and that agents coevolve."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,8 @@ from credo import tree
 from credo.algorithms.ccea import CCEA, assigned
 from credo.environments.extended_tmaze import ExtendedTMaze
 from credo.environments.probes import Meet
+from credo.evolution.islands import Islands
+from credo.evolution.mutation import MatrixMutation
 from credo.networks.dmmu import DMMU
 from credo.networks.mlp import MLP
 
@@ -100,3 +104,26 @@ def test_two_populations_learn_to_meet(fitness):
 def test_bad_settings_say_what_is_allowed(fields, told):
     with pytest.raises(ValueError, match=told):
         CCEA(Meet(), **fields)
+
+
+def test_islands_of_a_population_do_not_mix():
+    still = MatrixMutation(probability=0.0)
+    islands = Islands(2, renewal=0.0)
+    apart = dataclasses.replace(
+        SMALL, population_size=8, elite_fraction=0.25, mutation=still, islands=islands
+    )
+    assert (apart.lineage, apart.elites) == (4, 1)
+    state = apart.init(key=jax.random.key(0))
+    after, _ = apart.generation(state, key=jax.random.key(1))
+    for agent in range(apart.agents):
+        first = np.asarray(jax.tree.leaves(state.populations)[0][agent]).reshape(8, -1)
+        bred = np.asarray(jax.tree.leaves(after.populations)[0][agent]).reshape(8, -1)
+        parents = [int(np.flatnonzero((first == x).all(axis=1))[0]) for x in bred]
+        assert [parent // 4 for parent in parents] == [0] * 4 + [1] * 4
+
+
+def test_elites_are_counted_by_island():
+    with pytest.raises(ValueError, match=r"elite_fraction is 0.04 of 20 members"):
+        CCEA(Meet(), population_size=100, islands=Islands(5))
+    with pytest.raises(ValueError, match="4 islands for a population of 30"):
+        CCEA(Meet(), population_size=30, islands=Islands(4))

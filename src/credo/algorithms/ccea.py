@@ -19,6 +19,8 @@ Departures from the printed box:
 """
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar, Literal, Self
 
 import equinox as eqx
@@ -31,6 +33,7 @@ from ..compilation import jit
 from ..environments.base import AbstractEnvironment
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.extinction import Extinction
+from ..evolution.islands import Islands
 from ..evolution.mutation import AbstractMutation, MatrixMutation
 from ..evolution.selection import AbstractSelection, Tournament, rankable
 from ..networks.base import AbstractNetwork
@@ -67,6 +70,7 @@ class CCEA(eqx.Module):
     cross_repeated: bool = eqx.field(static=True, default=False)
     mating: tuple[AbstractCrossover, ...] = ()  # as in Neuroevolution
     extinction: Extinction = Extinction()
+    islands: Islands | None = None  # of each population; then elites and extinction are an island's
     fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
 
     def __check_init__(self):
@@ -83,7 +87,7 @@ class CCEA(eqx.Module):
         require.choice("teaming", self.teaming, ("random", "balanced"))
         require.choice("assignment", self.assignment, ("mean", "best"))
         require.signal(self.fitness, self.env.signals)
-        require.room(self.elite_fraction, self.population_size, 0, 0)
+        require.room(self.elite_fraction, self.lineage, 0, 0)
 
     @classmethod
     def ccea(cls, env: AbstractEnvironment, network: AbstractNetwork | None = None, **overrides):
@@ -97,8 +101,15 @@ class CCEA(eqx.Module):
         return {"ccea": cls.ccea}
 
     @property
+    def lineage(self) -> int:
+        """Members that breed among themselves: a population, or an island of it."""
+        k = self.population_size
+        return k if self.islands is None else self.islands.size(k)
+
+    @property
     def elites(self) -> int:
-        return int(self.elite_fraction * self.population_size)
+        """Of those."""
+        return int(self.elite_fraction * self.lineage)
 
     @property
     def agents(self) -> int:
@@ -178,9 +189,21 @@ def bred(
 ) -> PyTree:
     """The next generation of each population."""
     keys = jax.random.split(key, ccea.agents)
-    return eqx.filter_vmap(
-        lambda population, fitness, key: breed(ccea, population, fitness, key=key)
-    )(populations, fitness, keys)
+
+    def one(population, fitness, key):
+        if ccea.islands is None:
+            return breed(ccea, population, fitness, key=key)
+        apart = replace(ccea, population_size=ccea.lineage, islands=None)
+        breed_key, fresh_key = jax.random.split(key)
+        return ccea.islands(
+            partial(breed, apart),
+            lambda: apart.new_population(key=fresh_key),
+            population,
+            fitness,
+            key=breed_key,
+        )
+
+    return eqx.filter_vmap(one)(populations, fitness, keys)
 
 
 @jit
