@@ -16,7 +16,7 @@ from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
 from credo.experiments import base, chapter3, fig_3_4a
 from credo.networks.mmu import MMU
-from credo.runs import executor, page
+from credo.runs import config, executor, page
 from credo.runs.loop import Run, RunError, train
 
 BUDGETS = base.BUDGETS
@@ -144,6 +144,68 @@ def test_some_cells_alone(tmp_path, monkeypatch):
     assert record["command"].endswith("--budget quick --only '5-deep (ours|as coded)$'")
     with pytest.raises(RunError, match=r"no cell of .* has 'hopper' in its name"):
         base.reproduce("fig-3.4a", "quick", only="hopper", **folders)
+
+
+def recorded(cells, command, processor="one", **measured):
+    """A `results.json` of these cells."""
+    return {
+        "experiment": "fig-3.4a",
+        "budget": "quick",
+        "command": command,
+        "cells": {
+            cell.name: {
+                "runs": cell.runs,
+                "first seed": cell.first_seed,
+                "generations": cell.generations,
+                "algorithm": json.loads(json.dumps(config.to_tree(cell.algorithm))),
+            }
+            for cell in cells
+        },
+        "machine": {"processor": processor},
+        "measured": measured or {cell.name: f"{processor} {cell.name}" for cell in cells},
+    }
+
+
+def test_what_earlier_commands_measured_stays(capsys):
+    cells = fig_3_4a.cells("quick")
+    first, second, third, *_ = cells
+    earlier = recorded([third, first], "a", "old")
+    found = base.beside(earlier, recorded([second, first], "b", "new"), cells)
+    assert list(found["cells"]) == list(found["measured"]) == [c.name for c in cells[:3]]
+    assert found["measured"][first.name] == f"new {first.name}"
+    assert found["measured"][third.name] == f"old {third.name}"
+    assert found["command"] == "a && b"
+    machines = [cell.get("machine") for cell in found["cells"].values()]
+    assert machines == [None, None, {"processor": "old"}]
+    assert third.name in capsys.readouterr().err
+    again = base.beside(found, recorded([second], "b", "new"), cells)
+    assert again == found  # nothing is written twice
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda cell: cell["algorithm"].update(population_size=7),
+        lambda cell: cell["algorithm"].update(no_such_field=1),
+        lambda cell: cell.update({"first seed": 77}),
+        lambda cell: cell.update({"generations": 3}),
+    ],
+)
+def test_cells_with_other_settings_do_not_stay(change, capsys):
+    first, second, *_ = cells = fig_3_4a.cells("quick")
+    earlier, results = recorded([first], "a"), recorded([second], "b")
+    change(earlier["cells"][first.name])
+    assert base.beside(earlier, results, cells) == results
+    assert "settings have changed" in capsys.readouterr().err
+
+
+def test_fewer_runs_stay_and_numbers_of_all_cells_together_do_not():
+    first, second, *_ = cells = fig_3_4a.cells("quick")
+    earlier, results = recorded([first], "a"), recorded([second], "b")
+    earlier["cells"][first.name]["runs"] = 1
+    assert list(base.beside(earlier, results, cells)["cells"]) == [first.name, second.name]
+    together = recorded([first], "a", all_cells=1)
+    assert base.beside(together, results, cells) == results
 
 
 def test_committed_results_still_make_their_pages(tmp_path):

@@ -7,6 +7,7 @@ import pathlib
 import re
 import shlex
 import sys
+from collections.abc import Iterable
 from typing import Any, Protocol
 
 import equinox as eqx
@@ -108,7 +109,8 @@ def reproduce(
     """Run what is missing, measure, and write `results.json` and `report.html`.
 
     **Arguments:** `runs`: of each cell, instead of what the budget says. `only`: leave out cells in
-    whose name this regular expression is not found: "Hopper", "(erl|ddpg) Hopper".
+    whose name this regular expression is not found: "Hopper", "(erl|ddpg) Hopper". What earlier
+    commands measured of the others stays, where its settings are today's.
 
     **Returns:** the path of the page. **Raises:** `RunError` if there is no such budget or cell.
     """
@@ -155,10 +157,51 @@ def reproduce(
         "machine": config.machine(),
         "measured": module.measure(finished, budget),
     }
-    target = output / name / budget
-    target.mkdir(parents=True, exist_ok=True)
-    (target / "results.json").write_text(_compact(results))
-    return page(target / "results.json")
+    target = output / name / budget / "results.json"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if only is not None and target.exists():
+        results = beside(json.loads(target.read_text()), results, module.cells(budget))
+    target.write_text(_compact(results))
+    return page(target)
+
+
+def beside(earlier: dict[str, Any], results: dict[str, Any], cells: list[Cell]) -> dict[str, Any]:
+    """`results` with what else was measured `earlier`, if today's cells would be the same runs;
+    their number may differ. As it is where what was measured does not belong to cells."""
+    both = [earlier, results]
+    if any(record["measured"].keys() != record["cells"].keys() for record in both):
+        return results
+    kept = {
+        cell.name: earlier["cells"][cell.name]
+        for cell in cells
+        if cell.name in earlier["cells"].keys() - results["cells"].keys()
+        and _same_runs(earlier["cells"][cell.name], cell)
+    }
+    changed = earlier["cells"].keys() - results["cells"].keys() - kept.keys()
+    for what, names in (("kept", kept), ("left out, for their settings have changed", changed)):
+        if names:
+            print(f"cells measured earlier, {what}: {'; '.join(names)}", file=sys.stderr)
+    if not kept:
+        return results
+    if earlier["machine"] != results["machine"]:
+        kept = {name: {"machine": earlier["machine"]} | cell for name, cell in kept.items()}
+    order = [cell.name for cell in cells if cell.name in kept.keys() | results["cells"].keys()]
+    commands = dict.fromkeys([*earlier["command"].split(" && "), results["command"]])
+    found = {"command": " && ".join(commands), "cells": kept | results["cells"]}
+    found |= {"measured": {n: earlier["measured"][n] for n in kept} | results["measured"]}
+    for key in ("cells", "measured"):
+        found[key] = {name: found[key][name] for name in order}
+    return results | found
+
+
+def _same_runs(record: dict[str, Any], cell: Cell) -> bool:
+    given = {name: limit for name, limit in limits(cell).items() if limit is not None}
+    try:
+        algorithm = config.from_tree(record["algorithm"])
+    except (config.ConfigError, TypeError, ValueError):  # of an older Credo
+        return False
+    known = {k: v for k, v in record.items() if k not in ("runs", "algorithm", "machine")}
+    return known == given | {"first seed": cell.first_seed} and algorithm == cell.algorithm
 
 
 def budgets(name: str) -> tuple[str, ...]:
@@ -180,14 +223,20 @@ def page(results: pathlib.Path) -> pathlib.Path:
     """Write `report.html` beside a `results.json`, from its numbers alone."""
     record = json.loads(results.read_text())
     module: Any = importlib.import_module(f".{MODULES[record['experiment']]}", __package__)
-    machine = record["machine"]
+    cells = record["cells"]
+    machines = [
+        record["machine"],
+        *(cell["machine"] for cell in cells.values() if "machine" in cell),
+    ]
     facts = {
         "budget": record["budget"],
         "runs": ", ".join(
-            f"{name}: {cell['runs']} × {extent(cell)}" for name, cell in record["cells"].items()
+            f"{name}: {cell['runs']} × {extent(cell)}" for name, cell in cells.items()
         ),
-        "machine": f"{machine['processor']}, {machine['device']}, {machine['system']}",
-        "versions": ", ".join(f"{k} {v}" for k, v in machine["versions"].items()),
+        "machine": _once(f"{m['processor']}, {m['device']}, {m['system']}" for m in machines),
+        "versions": _once(
+            ", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines
+        ),
     }
     target = results.with_name("report.html")
     write(
@@ -201,6 +250,10 @@ def page(results: pathlib.Path) -> pathlib.Path:
         target,
     )
     return target
+
+
+def _once(texts: Iterable[str]) -> str:
+    return "; ".join(dict.fromkeys(texts))
 
 
 def extent(cell: dict[str, Any]) -> str:
