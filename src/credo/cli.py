@@ -496,7 +496,8 @@ class ReproduceOptions:
 
     budget: str = "quick"  # smoke (seconds), quick (minutes), full; some: million, published
     runs: int | None = None  # independent runs per cell; None: what the budget says
-    only: str | None = None  # cells whose name has this regular expression
+    only: str | None = None
+    """Cells whose name has this regular expression; what was measured of others stays."""
     jobs: int | None = None  # processes; None: one per core
     output: str = "reproduced"  # folder for the page and its data
     work: str = "runs/reproduce"  # folder for the runs behind them

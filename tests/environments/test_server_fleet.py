@@ -254,6 +254,7 @@ def test_vmap_equals_single(played):
         ({"schedule": ((5, 5),) * 10}, r"schedule\[0\] is \(5, 5\)"),
         ({"schedule": ((0, 5),) * 9 + ((15, 20),)}, r"schedule\[9\] is \(15, 20\).*joins < 15"),
         ({"schedule": ((0, 5, 9),) * 10}, r"schedule\[0\] is \(0, 5, 9\)"),
+        ({"servers": 2, "schedule": (3, 4)}, r"schedule\[0\] is 3: it must be \(joins, leaves\)"),
         ({"schedule": 7}, r"schedule is 7: give \(joins, leaves\)"),
         ({"observation": "vector"}, "observation is 'vector'"),
         ({"told": "never"}, "told is 'never'"),

@@ -127,9 +127,10 @@ class ServerFleet(AbstractEnvironment):
                 "(joins, leaves) for each"
             )
         for server, times in enumerate(self.schedule):
-            if len(times) != 2 or not 0 <= times[0] < min(times[1], self.max_steps):
+            pair = isinstance(times, Sequence) and len(times) == 2
+            if not pair or not 0 <= times[0] < min(times[1], self.max_steps):
                 raise ValueError(
-                    f"schedule[{server}] is {tuple(times)}: it must be (joins, leaves) with "
+                    f"schedule[{server}] is {times}: it must be (joins, leaves) with "
                     f"0 <= joins < leaves and joins < {self.max_steps}, the steps of an episode; "
                     f"(0, {self.max_steps}) is there all the time"
                 )
