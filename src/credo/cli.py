@@ -497,7 +497,8 @@ class ReproduceOptions:
     budget: str = "quick"  # smoke (seconds), quick (minutes), full; some: million, published
     runs: int | None = None  # independent runs per cell; None: what the budget says
     only: str | None = None
-    """Cells whose name has this regular expression; what was measured of others stays."""
+    """Cells whose name has this regular expression, as '2-deep, fsp'; a word that is in none lists
+    them. What was measured of other cells stays."""
     jobs: int | None = None  # processes; None: one per core
     output: str = "reproduced"  # folder for the page and its data
     work: str = "runs/reproduce"  # folder for the runs behind them

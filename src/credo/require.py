@@ -1,5 +1,6 @@
 """Checks of arguments: each says what was given and what is allowed."""
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -72,14 +73,17 @@ def _cannot_learn(env: Any, has: str, learners: Iterable[Any]) -> str:
     )
 
 
-def room(elite_fraction: float, population: int, learners: int, workers: int) -> None:
+def room(
+    elite_fraction: float, population: int, learners: int, workers: int, of: str = "members"
+) -> None:
     """A population with elites, and slots for the actors of learners that all play."""
     within("elite_fraction", elite_fraction, 0, 1)
     if not 1 <= int(elite_fraction * population) <= population - max(1, learners):
+        enough = math.ceil(1000 / population) / 1000
         raise ValueError(
-            f"elite_fraction is {elite_fraction} of {population} members: that must be at least 1, "
-            f"and leave {max(1, learners)} for offspring; give {1 / population:.2g} or more, or "
-            "a larger population"
+            f"elite_fraction is {elite_fraction} of {population} {of}: that must be at least 1, "
+            f"and leave {max(1, learners)} for offspring; give {enough:g} or more, or a larger "
+            "population"
         )
     if workers < learners:
         raise ValueError(

@@ -9,8 +9,10 @@ import pytest
 
 from credo import tree
 from credo.algorithms.ccea import CCEA, assigned
+from credo.algorithms.ccea import bred as bred_by
 from credo.environments.extended_tmaze import ExtendedTMaze
 from credo.environments.probes import Meet
+from credo.evolution.extinction import Extinction
 from credo.evolution.islands import Islands
 from credo.evolution.mutation import MatrixMutation
 from credo.networks.dmmu import DMMU
@@ -110,9 +112,14 @@ def test_islands_of_a_population_do_not_mix():
     still = MatrixMutation(probability=0.0)
     islands = Islands(2, renewal=0.0)
     apart = dataclasses.replace(
-        SMALL, population_size=8, elite_fraction=0.25, mutation=still, islands=islands
+        SMALL,
+        population_size=8,
+        elite_fraction=0.25,
+        mutation=still,
+        extinction=Extinction(probability=0.0),
+        islands=islands,
     )
-    assert (apart.lineage, apart.elites) == (4, 1)
+    assert apart.elites == 2
     state = apart.init(key=jax.random.key(0))
     after, _ = apart.generation(state, key=jax.random.key(1))
     for agent in range(apart.agents):
@@ -122,8 +129,32 @@ def test_islands_of_a_population_do_not_mix():
         assert [parent // 4 for parent in parents] == [0] * 4 + [1] * 4
 
 
+def test_the_weakest_island_of_each_population_is_settled_anew():
+    renewed = dataclasses.replace(
+        SMALL,
+        population_size=12,
+        elite_fraction=0.25,
+        mutation=MatrixMutation(probability=0.0),
+        extinction=Extinction(probability=0.0),
+        islands=Islands(3, renewal=1.0),
+    )
+    state = renewed.init(key=jax.random.key(0))
+    first = np.asarray(jax.tree.leaves(state.populations)[0]).reshape(2, 12, -1)
+    fitness = np.tile(np.arange(12.0), (2, 1))
+    fitness[1] = fitness[1, ::-1]
+    bred = jax.tree.leaves(bred_by(renewed, state.populations, fitness, key=jax.random.key(1)))[0]
+    old = (np.asarray(bred).reshape(2, 12, 1, -1) == first[:, None]).all(axis=3).any(axis=2)
+    assert old.reshape(2, 3, 4).all(axis=2).tolist() == [[False, True, True], [True, True, False]]
+    assert old.sum() == 16  # no other member is new
+
+
 def test_elites_are_counted_by_island():
-    with pytest.raises(ValueError, match=r"elite_fraction is 0.04 of 20 members"):
-        CCEA(Meet(), population_size=100, islands=Islands(5))
+    with pytest.raises(
+        ValueError, match=r"elite_fraction is 0.04 of 14 members of an island.*give 0.072 or"
+    ):
+        CCEA(Meet(), population_size=70, islands=Islands(5))
+    assert CCEA(Meet(), population_size=70, elite_fraction=0.072, islands=Islands(5)).elites == 5
+    with pytest.raises(TypeError, match=r"islands is 4: give Islands\(number=4\)"):
+        CCEA(Meet(), islands=4)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="4 islands for a population of 30"):
         CCEA(Meet(), population_size=30, islands=Islands(4))

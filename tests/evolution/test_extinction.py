@@ -35,7 +35,8 @@ def test_events_come_with_their_probability_and_take_their_share():
 
 
 @pytest.mark.parametrize(
-    ("probability", "magnitude", "share"), [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 1.0)]
+    ("probability", "magnitude", "share"),
+    [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 1, 1.0)],
 )
 def test_the_bounds(probability, magnitude, share):
     assert died(Extinction(probability, magnitude)).mean() == share

@@ -40,10 +40,16 @@ def test_islands_have_keys_of_their_own():
 
 @pytest.mark.parametrize(
     ("fitness", "weakest"),
-    [(FITNESS, 1), (FITNESS.at[0].set(jnp.nan), 0), (FITNESS.at[4:8].set(9.0), 2)],
+    [
+        (FITNESS, 1),
+        (FITNESS.at[4:8].set(9.0), 2),
+        (FITNESS.at[8].set(jnp.nan), 1),  # one NaN does not make an island weak
+        (FITNESS.at[8:].set(jnp.nan), 2),
+        (jnp.zeros(12), 1),  # of equals the first: the champion's island stays
+    ],
 )
 def test_the_island_with_the_worst_best_is_settled_anew(fitness, weakest):
-    bred = Islands(ISLANDS, renewal=1.0)(best_alone, lambda: FRESH, OLD, fitness, key=KEY)
+    bred = Islands(ISLANDS, renewal=1)(best_alone, lambda: FRESH, OLD, fitness, key=KEY)
     new = np.asarray(bred["b"]).reshape(ISLANDS, SIZE) == -1
     assert new.all(axis=1).tolist() == [i == weakest for i in range(ISLANDS)]
     assert new.sum() == SIZE
@@ -63,6 +69,10 @@ def test_a_population_that_cannot_be_divided_is_refused():
     assert Islands(4).size(100) == 25
     with pytest.raises(ValueError, match="3 islands for a population of 100"):
         Islands(3).size(100)
+    with pytest.raises(ValueError, match=r"20 islands for a population of 20: .* two members"):
+        Islands(20).size(20)
+    with pytest.raises(TypeError, match=r"number is 2.5: give how many"):
+        Islands(2.5)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="number is 1: it must be at least 2"):
         Islands(1)
     with pytest.raises(ValueError, match=r"renewal is 1.5: it must lie in \[0, 1\]"):

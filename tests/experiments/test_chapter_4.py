@@ -69,6 +69,8 @@ def test_cells_have_names_of_their_own_and_the_published_sizes(name):
         for cell in cells:
             algorithm = cell.algorithm
             assert (algorithm.population_size, algorithm.elites) == (100, 4)
+            islands = getattr(algorithm, "islands", None)
+            assert (islands is not None) == (cell.name[:8] == "converge" and ", fsp" in cell.name)
             if isinstance(algorithm, CCEA):
                 assert (algorithm.teams, algorithm.episodes, algorithm.test_episodes) == (5, 7, 15)
             else:

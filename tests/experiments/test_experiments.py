@@ -132,7 +132,7 @@ def test_some_cells_alone(tmp_path, monkeypatch):
     chosen = []
     monkeypatch.setattr(executor, "run", lambda jobs, *_, **__: chosen.extend(jobs))
     monkeypatch.setattr(base, "Run", lambda path: path)
-    monkeypatch.setattr(fig_3_4a, "measure", lambda runs, budget: {})
+    monkeypatch.setattr(fig_3_4a, "measure", lambda runs, budget: dict.fromkeys(runs, 1))
     monkeypatch.setattr(fig_3_4a, "sections", lambda measured: [])
     folders = {"output": tmp_path / "pages", "work": tmp_path / "work"}
     html = base.reproduce("fig-3.4a", "quick", only="5-deep (ours|as coded)$", **folders)
@@ -142,7 +142,16 @@ def test_some_cells_alone(tmp_path, monkeypatch):
     }
     record = json.loads(html.with_name("results.json").read_text())
     assert record["command"].endswith("--budget quick --only '5-deep (ours|as coded)$'")
-    with pytest.raises(RunError, match=r"no cell of .* has 'hopper' in its name"):
+    assert len(record["cells"]) == 2
+    html = base.reproduce("fig-3.4a", "quick", only="2-DEEP ours$", **folders)
+    record = json.loads(html.with_name("results.json").read_text())
+    assert len(record["cells"]) == 3
+    assert "classification 2-deep ours" in record["cells"]
+    assert list(record["measured"]) == list(record["cells"])
+    assert record["command"].count(" && ") == 1
+    with pytest.raises(RunError, match=r"only is '\(', no regular expression"):
+        base.reproduce("fig-3.4a", "quick", only="(", **folders)
+    with pytest.raises(RunError, match=r"no cell of .* has 'hopper' in its name at budget quick"):
         base.reproduce("fig-3.4a", "quick", only="hopper", **folders)
 
 
@@ -166,46 +175,68 @@ def recorded(cells, command, processor="one", **measured):
     }
 
 
-def test_what_earlier_commands_measured_stays(capsys):
+def written(tmp_path, record):
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps(record))
+    return path
+
+
+def test_what_earlier_commands_measured_stays(tmp_path, capsys):
     cells = fig_3_4a.cells("quick")
     first, second, third, *_ = cells
-    earlier = recorded([third, first], "a", "old")
-    found = base.beside(earlier, recorded([second, first], "b", "new"), cells)
+    path = written(tmp_path, recorded([third, first], "a", "old"))
+    earlier = base.kept(path, cells, [second, first])
+    assert capsys.readouterr().err == f"kept of {path}: {third.name}\n"
+    found = base.merged(earlier, recorded([second, first], "b", "new"), cells)
     assert list(found["cells"]) == list(found["measured"]) == [c.name for c in cells[:3]]
     assert found["measured"][first.name] == f"new {first.name}"
     assert found["measured"][third.name] == f"old {third.name}"
-    assert found["command"] == "a && b"
     machines = [cell.get("machine") for cell in found["cells"].values()]
     assert machines == [None, None, {"processor": "old"}]
-    assert third.name in capsys.readouterr().err
-    again = base.beside(found, recorded([second], "b", "new"), cells)
-    assert again == found  # nothing is written twice
+    for command, expected in (("b", "a && b"), ("a", "b && a")):  # the last one is last
+        again = base.kept(written(tmp_path, found), cells, [second])
+        again = base.merged(again, recorded([second], command, "new"), cells)
+        assert again == found | {"command": expected}
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "why"),
     [
-        lambda cell: cell["algorithm"].update(population_size=7),
-        lambda cell: cell["algorithm"].update(no_such_field=1),
-        lambda cell: cell.update({"first seed": 77}),
-        lambda cell: cell.update({"generations": 3}),
+        (lambda cell: cell["algorithm"].update(population_size=7), "population_size: 7 != 100"),
+        (lambda cell: cell["algorithm"].update(no_such_field=1), "cannot be read"),
+        (lambda cell: cell.pop("algorithm"), "cannot be read: 'algorithm'"),
+        (lambda cell: cell.update({"first seed": 77}), "first seed: 77 != "),
+        (lambda cell: cell.update({"generations": 3}), "generations: 3 != "),
+        (lambda cell: cell.update({"stop_at": 3.0}), "stop_at: 3.0 != None"),
     ],
 )
-def test_cells_with_other_settings_do_not_stay(change, capsys):
+def test_cells_with_other_settings_do_not_stay(tmp_path, change, why, capsys):
     first, second, *_ = cells = fig_3_4a.cells("quick")
-    earlier, results = recorded([first], "a"), recorded([second], "b")
-    change(earlier["cells"][first.name])
-    assert base.beside(earlier, results, cells) == results
-    assert "settings have changed" in capsys.readouterr().err
+    record = recorded([first], "a")
+    change(record["cells"][first.name])
+    assert base.kept(written(tmp_path, record), cells, [second]) is None
+    said = capsys.readouterr().err
+    assert said.startswith("not kept of ")
+    assert f"{first.name} (" in said
+    assert why in said
 
 
-def test_fewer_runs_stay_and_numbers_of_all_cells_together_do_not():
-    first, second, *_ = cells = fig_3_4a.cells("quick")
-    earlier, results = recorded([first], "a"), recorded([second], "b")
-    earlier["cells"][first.name]["runs"] = 1
-    assert list(base.beside(earlier, results, cells)["cells"]) == [first.name, second.name]
-    together = recorded([first], "a", all_cells=1)
-    assert base.beside(together, results, cells) == results
+def test_what_else_stays_and_does_not(tmp_path, capsys):
+    first, second, *others = cells = fig_3_4a.cells("quick")
+    fewer = recorded([first], "a")
+    fewer["cells"][first.name]["runs"] = 1
+    assert list(base.kept(written(tmp_path, fewer), cells, [second])["cells"]) == [first.name]
+    together = written(tmp_path, recorded([first], "a", all_cells=1))
+    assert base.kept(together, cells, [second]) is None
+    assert "of all its cells together" in capsys.readouterr().err
+    gone = written(tmp_path, recorded([first], "a"))
+    assert base.kept(gone, others, others[:1]) is None
+    assert "no such cell today" in capsys.readouterr().err
+    assert base.kept(tmp_path / "none.json", cells, [first]) is None
+    for damaged in ("{", "{}"):
+        (tmp_path / "results.json").write_text(damaged)
+        with pytest.raises(RunError, match=r"is no record of results .*move it away"):
+            base.kept(tmp_path / "results.json", cells, [first])
 
 
 def test_committed_results_still_make_their_pages(tmp_path):

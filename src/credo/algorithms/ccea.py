@@ -19,7 +19,6 @@ Departures from the printed box:
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar, Literal, Self
 
@@ -70,7 +69,9 @@ class CCEA(eqx.Module):
     cross_repeated: bool = eqx.field(static=True, default=False)
     mating: tuple[AbstractCrossover, ...] = ()  # as in Neuroevolution
     extinction: Extinction = Extinction()
-    islands: Islands | None = None  # of each population; then elites and extinction are an island's
+    islands: Islands | None = None
+    """Of each population. Every island then has its share of the elites, its own tournaments, mates
+    and events of extinction."""
     fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
 
     def __check_init__(self):
@@ -87,7 +88,14 @@ class CCEA(eqx.Module):
         require.choice("teaming", self.teaming, ("random", "balanced"))
         require.choice("assignment", self.assignment, ("mean", "best"))
         require.signal(self.fitness, self.env.signals)
-        require.room(self.elite_fraction, self.lineage, 0, 0)
+        require.at_least("population_size", self.population_size, 2)
+        if self.islands is None:
+            require.room(self.elite_fraction, self.population_size, 0, 0)
+        elif isinstance(self.islands, Islands):
+            size = self.islands.size(self.population_size)
+            require.room(self.elite_fraction, size, 0, 0, "members of an island")
+        else:
+            raise TypeError(f"islands is {self.islands!r}: give Islands(number=4), or None")
 
     @classmethod
     def ccea(cls, env: AbstractEnvironment, network: AbstractNetwork | None = None, **overrides):
@@ -101,15 +109,10 @@ class CCEA(eqx.Module):
         return {"ccea": cls.ccea}
 
     @property
-    def lineage(self) -> int:
-        """Members that breed among themselves: a population, or an island of it."""
-        k = self.population_size
-        return k if self.islands is None else self.islands.size(k)
-
-    @property
     def elites(self) -> int:
-        """Of those."""
-        return int(self.elite_fraction * self.lineage)
+        """Of each population, those of all its islands."""
+        n = self.islands.number if self.islands else 1
+        return n * int(self.elite_fraction * (self.population_size // n))
 
     @property
     def agents(self) -> int:
@@ -126,9 +129,10 @@ class CCEA(eqx.Module):
         """z: of each team; of an individual without partners what its φ teams would have."""
         return self.episodes * (self.teams if self.agents == 1 else 1)
 
-    def new_population(self, *, key: PRNGKeyArray) -> PyTree:
+    def new_population(self, size: int | None = None, *, key: PRNGKeyArray) -> PyTree:
+        """`size` members instead of `population_size`."""
         return eqx.filter_vmap(lambda key: self.network.init(*self.env.sizes[:2], key=key))(
-            jax.random.split(key, self.population_size)
+            jax.random.split(key, self.population_size if size is None else size)
         )
 
     def init(self, *, key: PRNGKeyArray) -> CCEAState:
@@ -193,11 +197,11 @@ def bred(
     def one(population, fitness, key):
         if ccea.islands is None:
             return breed(ccea, population, fitness, key=key)
-        apart = replace(ccea, population_size=ccea.lineage, islands=None)
+        size = ccea.islands.size(ccea.population_size)
         breed_key, fresh_key = jax.random.split(key)
         return ccea.islands(
-            partial(breed, apart),
-            lambda: apart.new_population(key=fresh_key),
+            partial(breed, ccea),
+            lambda: ccea.new_population(size, key=fresh_key),
             population,
             fitness,
             key=breed_key,

@@ -179,9 +179,10 @@ class Neuroevolution(eqx.Module):
         """e = int(ψ·k)"""
         return int(self.elite_fraction * self.population_size)
 
-    def new_population(self, *, key: PRNGKeyArray) -> PyTree:
+    def new_population(self, size: int | None = None, *, key: PRNGKeyArray) -> PyTree:
+        """`size` members instead of `population_size`."""
         return eqx.filter_vmap(lambda key: self.network.init(*self.env.sizes, key=key))(
-            jax.random.split(key, self.population_size)
+            jax.random.split(key, self.population_size if size is None else size)
         )
 
     def init(self, *, key: PRNGKeyArray) -> NeuroevolutionState:
@@ -266,11 +267,14 @@ def breed(
     *,
     key: PRNGKeyArray,
 ) -> PyTree:
-    """The next population: elites first, best to worst, then the offspring."""
+    """The next population: elites first, best to worst, then the offspring. It is as large as this
+    one, which may be a part of the algorithm's."""
     select_key, cross_key, mutate_key, extinct_key, fresh_key, *mate_keys = jax.random.split(
         key, 5 + len(algorithm.mating)
     )
-    n = algorithm.population_size - algorithm.elites
+    k = tree.size(population)
+    e = int(algorithm.elite_fraction * k)
+    n = k - e
     pack, unpack = tree.packing(population)
     rows = eqx.filter_vmap(pack)(population)
 
@@ -284,7 +288,7 @@ def breed(
         return tree.in_batches(jax.vmap(one), (jax.random.split(key, n), *parents))
 
     # 6-7: Rank the population; select the first e as elites.
-    elites = tree.take(rows, ranking(fitness)[: algorithm.elites])
+    elites = tree.take(rows, ranking(fitness)[:e])
     # 8: Select (k - e) networks, to form set S.
     selected = algorithm.selection(fitness, n, key=select_key)
     offspring = tree.take(rows, selected)
@@ -299,7 +303,7 @@ def breed(
         offspring = each(operator, offspring, mates, key=cross_key)
 
     def fresh():
-        made = algorithm.new_population(key=fresh_key)
+        made = algorithm.new_population(k, key=fresh_key)
         return eqx.filter_vmap(pack)(tree.take(made, jnp.arange(n)))
 
     offspring = algorithm.extinction(offspring, fresh, key=extinct_key)
@@ -317,10 +321,10 @@ def recombine(
 ) -> PyTree:
     """Give some offspring a random elite as the first parent."""
     chance_key, mate_key, cross_key = jax.random.split(key, 3)
-    n = tree.size(offspring)
-    if algorithm.elites == 0 or isinstance(algorithm.crossover, NoCrossover):
+    n, e = tree.size(offspring), tree.size(elites)
+    if e == 0 or isinstance(algorithm.crossover, NoCrossover):
         return offspring
-    mates = tree.take(elites, jax.random.randint(mate_key, (n,), 0, algorithm.elites))
+    mates = tree.take(elites, jax.random.randint(mate_key, (n,), 0, e))
     children = each(algorithm.crossover, mates, offspring, key=cross_key)
     crossed = jax.random.bernoulli(chance_key, algorithm.crossover_probability, (n,))
     crossed = crossed | (repeat & algorithm.cross_repeated)

@@ -127,7 +127,7 @@ class ServerFleet(AbstractEnvironment):
                 "(joins, leaves) for each"
             )
         for server, times in enumerate(self.schedule):
-            pair = isinstance(times, Sequence) and len(times) == 2
+            pair = isinstance(times, tuple | list) and len(times) == 2
             if not pair or not 0 <= times[0] < min(times[1], self.max_steps):
                 raise ValueError(
                     f"schedule[{server}] is {times}: it must be (joins, leaves) with "

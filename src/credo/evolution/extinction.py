@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray, PyTree
 
 from .. import require, tree
@@ -27,8 +28,10 @@ class Extinction(eqx.Module):
         makes another one like it, and is asked when there is an event alone (under `vmap`
         always)."""
         event_key, member_key = jax.random.split(key)
-        event = jax.random.bernoulli(event_key, self.probability)
-        dies = jax.random.bernoulli(member_key, self.magnitude, (tree.size(population),))
+        event = jax.random.bernoulli(event_key, jnp.float32(self.probability))
+        dies = jax.random.bernoulli(
+            member_key, jnp.float32(self.magnitude), (tree.size(population),)
+        )
         arrays, rest = eqx.partition(population, eqx.is_array)
 
         def seeded():

@@ -109,22 +109,30 @@ def reproduce(
     """Run what is missing, measure, and write `results.json` and `report.html`.
 
     **Arguments:** `runs`: of each cell, instead of what the budget says. `only`: leave out cells in
-    whose name this regular expression is not found: "Hopper", "(erl|ddpg) Hopper". What earlier
-    commands measured of the others stays, where its settings are today's.
+    whose name this regular expression is not found, in whatever case: "(erl|ddpg) Hopper". What
+    earlier commands measured of the others stays, where its settings are today's.
 
     **Returns:** the path of the page. **Raises:** `RunError` if there is no such budget or cell.
     """
     module: Any = importlib.import_module(f".{MODULES[name]}", __package__)
     if budget not in (known := budgets(name)):
         raise RunError(f"{name} has no budget {budget!r}: it has {', '.join(known)}")
+    try:
+        pattern = re.compile(only or "", re.IGNORECASE)
+    except re.error as error:
+        raise RunError(f"only is {only!r}, no regular expression: {error}") from error
     cells = [
         cell if runs is None else dataclasses.replace(cell, runs=runs)
         for cell in module.cells(budget)
-        if re.search(only or "", cell.name)
+        if pattern.search(cell.name)
     ]
     if not cells:
         names = "; ".join(cell.name for cell in module.cells(budget))
-        raise RunError(f"no cell of {name} has {only!r} in its name: there are {names}")
+        raise RunError(
+            f"no cell of {name} has {only!r} in its name at budget {budget}: there are {names}"
+        )
+    target = output / name / budget / "results.json"
+    earlier = kept(target, module.cells(budget), cells) if only is not None else None
     folder = {
         cell.name: [work / budget / cell.name / str(s) for s in seeds(cell)] for cell in cells
     }
@@ -157,51 +165,82 @@ def reproduce(
         "machine": config.machine(),
         "measured": module.measure(finished, budget),
     }
-    target = output / name / budget / "results.json"
+    if earlier is not None:
+        results = merged(earlier, results, module.cells(budget))
     target.parent.mkdir(parents=True, exist_ok=True)
-    if only is not None and target.exists():
-        results = beside(json.loads(target.read_text()), results, module.cells(budget))
-    target.write_text(_compact(results))
+    draft = target.with_name(".results.json.draft")
+    draft.write_text(_compact(results))
+    draft.replace(target)
     return page(target)
 
 
-def beside(earlier: dict[str, Any], results: dict[str, Any], cells: list[Cell]) -> dict[str, Any]:
-    """`results` with what else was measured `earlier`, if today's cells would be the same runs;
-    their number may differ. As it is where what was measured does not belong to cells."""
-    both = [earlier, results]
-    if any(record["measured"].keys() != record["cells"].keys() for record in both):
-        return results
-    kept = {
-        cell.name: earlier["cells"][cell.name]
-        for cell in cells
-        if cell.name in earlier["cells"].keys() - results["cells"].keys()
-        and _same_runs(earlier["cells"][cell.name], cell)
-    }
-    changed = earlier["cells"].keys() - results["cells"].keys() - kept.keys()
-    for what, names in (("kept", kept), ("left out, for their settings have changed", changed)):
-        if names:
-            print(f"cells measured earlier, {what}: {'; '.join(names)}", file=sys.stderr)
-    if not kept:
-        return results
-    if earlier["machine"] != results["machine"]:
-        kept = {name: {"machine": earlier["machine"]} | cell for name, cell in kept.items()}
-    order = [cell.name for cell in cells if cell.name in kept.keys() | results["cells"].keys()]
-    commands = dict.fromkeys([*earlier["command"].split(" && "), results["command"]])
-    found = {"command": " && ".join(commands), "cells": kept | results["cells"]}
-    found |= {"measured": {n: earlier["measured"][n] for n in kept} | results["measured"]}
-    for key in ("cells", "measured"):
-        found[key] = {name: found[key][name] for name in order}
-    return results | found
-
-
-def _same_runs(record: dict[str, Any], cell: Cell) -> bool:
-    given = {name: limit for name, limit in limits(cell).items() if limit is not None}
+def kept(path: pathlib.Path, cells: list[Cell], chosen: list[Cell]) -> dict[str, Any] | None:
+    """What was measured earlier of cells that are not `chosen` now, if today's runs of them would
+    be the same (their number may differ; versions of Credo may too). Says what stays and what does
+    not, and why."""
+    if not path.exists():
+        return None
     try:
-        algorithm = config.from_tree(record["algorithm"])
-    except (config.ConfigError, TypeError, ValueError):  # of an older Credo
-        return False
+        record = json.loads(path.read_text())
+        measured, recorded, machine, _ = (
+            record[name] for name in ("measured", "cells", "machine", "command")
+        )
+    except (ValueError, KeyError) as error:
+        raise RunError(
+            f"{path} is no record of results ({error!r}): move it away, or choose another --output"
+        ) from error
+    others = [name for name in recorded if name not in {cell.name for cell in chosen}]
+    known = {cell.name: cell for cell in cells}
+    stay = []
+    for name in others:
+        why = _other_runs(recorded[name], known.get(name))
+        if measured.keys() != recorded.keys():
+            why = ["numbers of this experiment are of all its cells together"]
+        if why:
+            print(f"not kept of {path}: {name} ({'; '.join(why)})", file=sys.stderr)
+        else:
+            stay.append(name)
+    if not stay:
+        return None
+    print(f"kept of {path}: {'; '.join(stay)}", file=sys.stderr)
+    found = {name: {"machine": machine} | recorded[name] for name in stay}
+    return record | {"cells": found, "measured": {name: measured[name] for name in stay}}
+
+
+def merged(earlier: dict[str, Any], results: dict[str, Any], cells: list[Cell]) -> dict[str, Any]:
+    """Results of two commands, in the order of `cells`. A cell names its machine if that is not
+    the last command's."""
+    here = results["machine"]
+    old = {
+        name: {key: value for key, value in cell.items() if (key, value) != ("machine", here)}
+        for name, cell in earlier["cells"].items()
+    }
+    both = {"cells": old | results["cells"], "measured": earlier["measured"] | results["measured"]}
+    order = [cell.name for cell in cells if cell.name in both["cells"]]
+    now = results["command"]
+    before = [command for command in earlier["command"].split(" && ") if command != now]
+    return (
+        results
+        | {"command": " && ".join([*before, now])}
+        | {key: {name: value[name] for name in order} for key, value in both.items()}
+    )
+
+
+def _other_runs(record: dict[str, Any], cell: Cell | None) -> list[str]:
+    """How the runs of a recorded cell differ from today's."""
+    if cell is None:
+        return ["there is no such cell today"]
+    try:
+        # A field that came after that run has its default.
+        algorithm = config.to_tree(config.from_tree(record["algorithm"]))
+    except (KeyError, TypeError, ValueError) as error:
+        return [f"its record cannot be read: {error}"]
+    given = {name: limit for name, limit in limits(cell).items() if limit is not None}
+    given |= {"first seed": cell.first_seed}
     known = {k: v for k, v in record.items() if k not in ("runs", "algorithm", "machine")}
-    return known == given | {"first seed": cell.first_seed} and algorithm == cell.algorithm
+    today = json.loads(json.dumps(config.to_tree(cell.algorithm)))
+    algorithm = json.loads(json.dumps(algorithm))
+    return config.differences(known, given) + config.differences(algorithm, today)
 
 
 def budgets(name: str) -> tuple[str, ...]:

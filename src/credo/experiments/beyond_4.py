@@ -202,7 +202,7 @@ def sections(measured: dict[str, Any]) -> list[Any]:
             chapter4.about(
                 "`on difference`: the fitness of an individual is its own difference reward; tests "
                 "and tables are of the score.",
-                "Converge is trained on the author's bonuses, as in Figure 4.2.",
+                f"Converge is trained on the author's bonuses, as in Figure 4.2. {chapter4.APART}",
                 "LSTMs and GRUs have as many units as an MMU, and the operators that were chosen "
                 "for it.",
             )
