@@ -31,6 +31,9 @@ TRAIN = {
     "--updates 2 --network.hidden 3 --train-size 100",
     "ccea": "ccea credo.environments.probes:Meet --population-size 6 --elite-fraction 0.2 "
     "--teams 2 --episodes 2 --test-episodes 4 --network.hidden 4",
+    "islands": "ccea credo.environments.probes:Meet --population-size 6 --elite-fraction 0.34 "
+    "--teams 2 --episodes 2 --test-episodes 4 --network.hidden 4 "
+    "islands:islands --islands.number 2 --islands.renewal 0.05",
     "dmmu": "neuroevolution credo.environments.probes:Meet --network dmmu --network.hidden 3 "
     "--population-size 6 --elite-fraction 0.2 --episodes 2 --test-episodes 4",
     "erl": f"erl InvertedPendulum-v5 {SMALL} --sync-period 2",
@@ -44,6 +47,7 @@ GENERATIONS = {  # enough for 20 kills
     "neuroevolution": 100_000,
     "bptt": 20_000,
     "ccea": 60_000,
+    "islands": 60_000,
     "dmmu": 20_000,
     "erl": 300,
     "cerl": 150,
@@ -54,13 +58,15 @@ GENERATIONS = {  # enough for 20 kills
 
 def start(run: pathlib.Path, what: str, generations: int) -> subprocess.Popen:
     """Resume the run if there is one to resume, else train."""
+    often = ["--checkpoint-every", "0.05"]
     if (run / "config.json").exists():
-        arguments = ["resume", str(run)]
+        arguments = ["resume", str(run), *often]
     else:
-        arguments = ["train", *TRAIN[what].split(), "--generations", str(generations)]
-        arguments += ["--path", str(run)]
+        algorithm, task, *flags = TRAIN[what].split()
+        budget = ["--generations", str(generations), "--path", str(run)]
+        arguments = ["train", algorithm, task, *budget, *often, *flags]
     return subprocess.Popen(
-        [sys.executable, "-m", "credo.cli", *arguments, "--checkpoint-every", "0.05"],
+        [sys.executable, "-m", "credo.cli", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

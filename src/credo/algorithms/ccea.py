@@ -14,6 +14,7 @@ Departures from the printed box:
 - All teams of a generation play in the same worlds. With one population a team is its individual,
   and its φ teams would repeat each other: it plays φ·z simulations instead, each in another world,
   and neither `teaming` nor `assignment` changes anything.
+- A population may be in `islands` that breed apart; the box has none, and they are off by default.
 - The operators are those of Algorithm 2; the author's code drew φ 1 and z 10, and crossed too.
 - Feed-forward networks have their biases mutated; the author's code left those alone.
 """
