@@ -151,7 +151,7 @@ def test_some_cells_alone(tmp_path, monkeypatch):
     assert record["command"].count(" && ") == 1
     with pytest.raises(RunError, match=r"only is '\(', no regular expression"):
         base.reproduce("fig-3.4a", "quick", only="(", **folders)
-    with pytest.raises(RunError, match=r"no cell of .* has 'hopper' in its name at budget quick"):
+    with pytest.raises(RunError, match=r"no cell of .* at budget quick has 'hopper' in its"):
         base.reproduce("fig-3.4a", "quick", only="hopper", **folders)
 
 

@@ -117,22 +117,12 @@ def reproduce(
     module: Any = importlib.import_module(f".{MODULES[name]}", __package__)
     if budget not in (known := budgets(name)):
         raise RunError(f"{name} has no budget {budget!r}: it has {', '.join(known)}")
-    try:
-        pattern = re.compile(only or "", re.IGNORECASE)
-    except re.error as error:
-        raise RunError(f"only is {only!r}, no regular expression: {error}") from error
-    cells = [
-        cell if runs is None else dataclasses.replace(cell, runs=runs)
-        for cell in module.cells(budget)
-        if pattern.search(cell.name)
-    ]
-    if not cells:
-        names = "; ".join(cell.name for cell in module.cells(budget))
-        raise RunError(
-            f"no cell of {name} has {only!r} in its name at budget {budget}: there are {names}"
-        )
+    every = module.cells(budget)
+    cells = every if only is None else named(every, only, f"{name} at budget {budget}")
+    if runs is not None:
+        cells = [dataclasses.replace(cell, runs=runs) for cell in cells]
     target = output / name / budget / "results.json"
-    earlier = kept(target, module.cells(budget), cells) if only is not None else None
+    earlier = None if only is None else kept(target, every, cells)
     folder = {
         cell.name: [work / budget / cell.name / str(s) for s in seeds(cell)] for cell in cells
     }
@@ -166,12 +156,25 @@ def reproduce(
         "measured": module.measure(finished, budget),
     }
     if earlier is not None:
-        results = merged(earlier, results, module.cells(budget))
+        results = merged(earlier, results, every)
     target.parent.mkdir(parents=True, exist_ok=True)
     draft = target.with_name(".results.json.draft")
     draft.write_text(_compact(results))
     draft.replace(target)
     return page(target)
+
+
+def named(cells: list[Cell], only: str, where: str) -> list[Cell]:
+    """Those in whose name the regular expression is found; RunError if there are none."""
+    try:
+        pattern = re.compile(only, re.IGNORECASE)
+    except re.error as error:
+        raise RunError(f"only is {only!r}, no regular expression: {error}") from error
+    found = [cell for cell in cells if pattern.search(cell.name)]
+    if not found:
+        names = "; ".join(cell.name for cell in cells)
+        raise RunError(f"no cell of {where} has {only!r} in its name: there are {names}")
+    return found
 
 
 def kept(path: pathlib.Path, cells: list[Cell], chosen: list[Cell]) -> dict[str, Any] | None:
@@ -230,17 +233,15 @@ def _other_runs(record: dict[str, Any], cell: Cell | None) -> list[str]:
     """How the runs of a recorded cell differ from today's."""
     if cell is None:
         return ["there is no such cell today"]
+    today = json.loads(json.dumps(config.to_tree(cell.algorithm)))
     try:
-        # A field that came after that run has its default.
-        algorithm = config.to_tree(config.from_tree(record["algorithm"]))
+        lines = config.changed(record["algorithm"], today)
     except (KeyError, TypeError, ValueError) as error:
         return [f"its record cannot be read: {error}"]
     given = {name: limit for name, limit in limits(cell).items() if limit is not None}
     given |= {"first seed": cell.first_seed}
     known = {k: v for k, v in record.items() if k not in ("runs", "algorithm", "machine")}
-    today = json.loads(json.dumps(config.to_tree(cell.algorithm)))
-    algorithm = json.loads(json.dumps(algorithm))
-    return config.differences(known, given) + config.differences(algorithm, today)
+    return config.differences(known, given) + lines
 
 
 def budgets(name: str) -> tuple[str, ...]:

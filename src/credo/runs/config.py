@@ -143,6 +143,12 @@ def differences(a: Any, b: Any, path: str = "") -> list[str]:
     return [] if a == b else [f"{path}: {a!r} != {b!r}"]
 
 
+def changed(recorded: Any, today: Any) -> list[str]:
+    """Where the tree of an object that was recorded differs from today's tree of one. A field that
+    came after the record has its default. Raises `ConfigError` if there is no such object today."""
+    return differences(to_tree(from_tree(recorded)), today)
+
+
 def machine() -> dict[str, Any]:
     """What a result depends on beside the config."""
     versions = {name: version for name in PACKAGES if (version := _version(name)) is not None}

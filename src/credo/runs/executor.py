@@ -57,9 +57,7 @@ class Job:
         if not (self.path / "config.json").exists():
             return False
         run = Run(self.path)
-        # A field that came after that run has its default.
-        of_today = config.to_tree(config.from_tree(run.config["algorithm"]))
-        lines = config.differences(of_today, self.tree)
+        lines = config.changed(run.config["algorithm"], self.tree)
         recorded, budget = Budget.read(run.config["budget"]), self.budget
         for name in ("generations", "frames"):
             old, new = getattr(recorded, name), getattr(budget, name)
