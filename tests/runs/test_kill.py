@@ -14,18 +14,18 @@ specification.loader.exec_module(kill)
 
 
 def test_killed_three_times(tmp_path):
-    assert kill.compare(tmp_path, kills=3, generations=600, seed=1) == []
-    assert kill.rows(tmp_path / "killed") > 2  # dispatches, so there was something to kill
-    newest = sorted(p.name for p in (tmp_path / "killed" / "checkpoints").iterdir())[-1]
+    assert kill.compare(tmp_path, times=3, generations=600, seed=1) == []
+    assert kill.rows(tmp_path / "disturbed") > 2  # dispatches, so there was something to kill
+    newest = sorted(p.name for p in (tmp_path / "disturbed" / "checkpoints").iterdir())[-1]
     assert newest == "00000600"
 
 
 @pytest.mark.parametrize(("what", "generations"), [("merl", 800), ("matd3", 1200)])
 def test_teams_killed_once_while_they_train(tmp_path, what, generations):
     assert kill.compare(tmp_path, 1, generations, seed=10, what=what) == []
-    newest = sorted(p.name for p in (tmp_path / "killed" / "checkpoints").iterdir())[-1]
+    newest = sorted(p.name for p in (tmp_path / "disturbed" / "checkpoints").iterdir())[-1]
     assert newest == f"{generations:08d}"
-    columns, *_, last = (tmp_path / "killed" / "metrics.csv").read_text().splitlines()
+    columns, *_, last = (tmp_path / "disturbed" / "metrics.csv").read_text().splitlines()
     told = dict(zip(columns.split(","), last.split(","), strict=True))
     assert int(told["updates"]) > 0  # it had learned
 
