@@ -41,10 +41,12 @@ def whole(path: str | os.PathLike[str]) -> Iterator[Path]:
             raise OSError(errno.EBUSY, "somebody else writes it at the same time", str(path))
         os.fsync(descriptor)
         os.replace(draft, path)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(OSError):  # the first error counts
             if os.fstat(descriptor).st_nlink:  # or it would be somebody else's
                 remove(draft)
+        if isinstance(error, OSError):
+            raise _named(error, path) from error
         raise
     finally:
         os.close(descriptor)
@@ -56,21 +58,20 @@ def write_whole(path: str | os.PathLike[str], chunks: Iterable[Chunk]) -> None:
     with whole(path) as draft:
         descriptor = opened(draft, os.O_WRONLY)
         try:
-            _write(descriptor, chunks)
+            _write(descriptor, path, chunks)
         finally:
             os.close(descriptor)
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write `text` as UTF-8, whole or not at all; lines end as in `text`."""
-    write_whole(path, [text.encode()])
+    # A path that is no text holds lone surrogates, which are spelled as JSON does.
+    write_whole(path, [text.encode(errors="backslashreplace")])
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
     """Write `value` as JSON, whole or not at all."""
-    text = json.dumps(value, indent=1, ensure_ascii=False) + "\n"
-    # A path that is no text holds lone surrogates: JSON spells them so.
-    write_whole(path, [text.encode(errors="backslashreplace")])
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n")
 
 
 def write_new(path: str | os.PathLike[str], chunks: Iterable[Chunk]) -> None:
@@ -80,7 +81,7 @@ def write_new(path: str | os.PathLike[str], chunks: Iterable[Chunk]) -> None:
     """
     descriptor = opened(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
     try:
-        _write(descriptor, chunks)
+        _write(descriptor, path, chunks)
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
@@ -93,7 +94,7 @@ def append(path: str | os.PathLike[str], data: bytes) -> None:
     try:
         before = os.fstat(descriptor).st_size
         try:
-            _write(descriptor, [data])
+            _write(descriptor, path, [data])
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(descriptor, before)
@@ -167,8 +168,18 @@ def advice(error: OSError) -> str:
     return "free some space" if error.errno in FULL else "see to that"
 
 
-def _write(descriptor: int, chunks: Iterable[Chunk]) -> None:
+def _write(descriptor: int, path: str | os.PathLike[str], chunks: Iterable[Chunk]) -> None:
     for chunk in chunks:
         rest = memoryview(chunk)
         while rest:
-            rest = rest[os.write(descriptor, rest) :]
+            try:
+                rest = rest[os.write(descriptor, rest) :]
+            except OSError as error:
+                raise _named(error, path) from error
+
+
+def _named(error: OSError, path: str | os.PathLike[str]) -> OSError:
+    """The same error with its file: what is written to a descriptor fails without a name."""
+    if error.filename is not None or error.errno is None:
+        return error
+    return OSError(error.errno, error.strerror, str(path))
