@@ -4,7 +4,7 @@ import contextlib
 import os
 import pathlib
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from . import files
@@ -12,7 +12,7 @@ from .lock import lock
 from .record import NAME, RunError
 
 DRAFT = re.compile(r"\.config\.json\.draft(\.json)?")
-FIRST = re.compile(r"\.?0{8}[\w.]*")  # the checkpoint of generation 0, finished or not
+FIRST = re.compile(r"\.?0{8}[\w.-]*")  # the checkpoint of generation 0, finished or not
 PART = re.compile(r"\.?(state\.safetensors|counters\.json|COMMIT|replay\d[\w.-]*)(\.draft\w*)?")
 
 
@@ -73,26 +73,27 @@ def new_folder(path: pathlib.Path) -> Iterator[None]:
 def _leftover(path: pathlib.Path) -> bool:
     """Whether all that is in a folder was left by a process of ours that died before its run began:
     nothing but the first checkpoint, or less, and what holds the folder meanwhile."""
-    for entry in os.scandir(path):
+    for entry in path.iterdir():
         if entry.name == "lock" or DRAFT.fullmatch(entry.name):
-            ours = entry.is_file(follow_symlinks=False)
+            ours = entry.is_file() and not entry.is_symlink()
         else:
-            folder = entry.name == "checkpoints" and entry.is_dir(follow_symlinks=False)
-            ours = folder and all(map(_first_checkpoint, os.scandir(entry.path)))
+            ours = entry.name == "checkpoints" and _holds(entry, _first_checkpoint)
         if not ours:
             return False
     return True
 
 
-def _first_checkpoint(entry: "os.DirEntry[str]") -> bool:
-    return (
-        FIRST.fullmatch(entry.name) is not None
-        and entry.is_dir(follow_symlinks=False)
-        and all(
-            PART.fullmatch(file.name) and file.is_file(follow_symlinks=False)
-            for file in os.scandir(entry.path)
-        )
+def _first_checkpoint(path: pathlib.Path) -> bool:
+    return FIRST.fullmatch(path.name) is not None and _holds(
+        path, lambda file: bool(PART.fullmatch(file.name)) and file.is_file()
     )
+
+
+def _holds(path: pathlib.Path, ours: Callable[[pathlib.Path], bool]) -> bool:
+    """Whether `path` is a folder of which every entry is one of ours, and none is a link."""
+    if path.is_symlink() or not path.is_dir():
+        return False
+    return all(ours(entry) and not entry.is_symlink() for entry in path.iterdir())
 
 
 def _refuse_occupied(path: pathlib.Path) -> None:

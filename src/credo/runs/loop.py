@@ -13,9 +13,7 @@ A run is a folder:
 import contextlib
 import dataclasses
 import json
-import os
 import pathlib
-import re
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -33,7 +31,8 @@ from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..replay import Replay, shapes_alone
 from . import checkpoint, config, files, log, record, screen, weights
 from .budget import Budget, fitted
-from .folder import free_name, new_folder, runs_in
+from .folder import free_name, new_folder
+from .folder import runs_in as runs_in
 from .lock import lock
 from .progress import Progress
 from .record import RunError
@@ -353,28 +352,23 @@ def _verify_metrics(path: pathlib.Path) -> None:
     """Raise `RunError` if metrics.csv is not what the newest intact checkpoint says it was."""
     for folder in sorted((path / "checkpoints").glob("[0-9]*"), reverse=True):
         try:
-            commit = json.loads(files.read_bytes(folder / checkpoint.COMMIT))
-            generation, sealed = commit["generation"], commit["seals"]["metrics"]
+            sealed = json.loads(files.read_bytes(folder / checkpoint.COMMIT))["seals"]["metrics"]
         except (OSError, ValueError, KeyError, TypeError):
             continue  # damaged, or written by an older version
-        why = _unlike(path, generation, sealed)
+        why = _unlike(path, sealed)
         if why is None:
             return
         if checkpoint.damage(folder) is None:
-            raise RunError(
-                f"{why}: restore it from a copy, or `credo resume {path}` trains again what is "
-                "not sure"
-            )
+            raise RunError(f"{why}, or `credo resume {path}` trains again what is not sure")
 
 
-def _unlike(path: pathlib.Path, generation: int, sealed: Any) -> str | None:
+def _unlike(path: pathlib.Path, sealed: Any) -> str | None:
     """How metrics.csv differs from what a checkpoint sealed, in words."""
     try:
-        if log.seal(path, generation) == sealed:
-            return None
-    except (OSError, ValueError) as error:
-        return f"{path / 'metrics.csv'} is damaged: {error}"
-    return f"{path / 'metrics.csv'} is not what it was at generation {generation}"
+        log.verify(path, sealed)
+    except (ValueError, KeyError, TypeError) as error:
+        return str(error)
+    return None
 
 
 def _load(run: Run, algorithm: Any, without_replay: bool = False) -> checkpoint.Checkpoint:
@@ -383,7 +377,7 @@ def _load(run: Run, algorithm: Any, without_replay: bool = False) -> checkpoint.
     def check(generation: int, seals: Mapping[str, Any]) -> str | None:
         why = record.stranger(run.config, seals.get("record"))
         if why is None and "metrics" in seals:
-            why = _unlike(run.path, generation, seals["metrics"])
+            why = _unlike(run.path, seals["metrics"])
         return why
 
     like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0))
@@ -411,10 +405,11 @@ def _train(
     state, generation, frames = saved.state, saved.generation, int(saved.counters["frames"])
     del saved  # the state is donated: nobody may hold the old one
     budget = Budget.read(run.config["budget"])
+    log.Log(run.path, generation, tensorboard=False)  # what came after need not be readable
     rows = log.read(run.path / "metrics.csv")
     reached = budget.reached(generation, frames, _score_at(rows, generation))
     journal = log.Log(run.path, generation, tensorboard=tensorboard and not reached)
-    before = _elapsed(run.path)
+    before = journal.elapsed
     began = last_save = time.monotonic()
     safe, chunk, ended = generation, 1, False
 
@@ -591,16 +586,6 @@ def _require_sound(run: Run, state: PyTree, generation: int, safe: int) -> None:
 def _buffers(state: PyTree) -> list[Replay]:
     leaves = jax.tree.leaves(state, is_leaf=lambda x: isinstance(x, Replay))
     return [leaf for leaf in leaves if isinstance(leaf, Replay)]
-
-
-def _elapsed(path: pathlib.Path) -> float:
-    """Seconds that a run took so far. Its clock is worth nothing but itself: a damaged one starts
-    anew."""
-    try:
-        return float(log.read(path / "timing.csv").get("seconds", np.zeros(1))[-1])
-    except (OSError, ValueError, IndexError):
-        files.remove(path / "timing.csv")
-        return 0.0
 
 
 def _score_at(rows: dict[str, np.ndarray], generation: int) -> float:
