@@ -33,6 +33,11 @@ class Single:
     """What all copies of a Gymnasium environment have in common, taken from the first."""
 
     agents: ClassVar[int | None] = None
+    obs_dtype: ClassVar[str] = "float32"
+    signals: ClassVar[list[tuple[str, bool]]] = [("reward", False)]  # name, private to an agent
+    actions: ClassVar[Any] = None
+    observations: ClassVar[Any] = None
+    warnings: ClassVar[list[str]] = []
 
     @staticmethod
     def make(spec: dict[str, Any]) -> gymnasium.Env:
@@ -68,7 +73,7 @@ class Single:
         _count(result, 5, "step", "(observation, reward, terminated, truncated, info)")
         obs, reward, terminated, truncated, _ = result
         self._write(obs, frame.obs[i])
-        frame.rewards[i] = reward if isinstance(reward, (float, int)) else _number(reward)
+        frame.rewards["reward"][i] = reward if isinstance(reward, (float, int)) else _number(reward)
         frame.terminated[i] = terminated
         frame.truncated[i] = truncated
         return terminated or truncated
@@ -82,6 +87,11 @@ class Team:
     """
 
     discrete = False
+    obs_dtype: ClassVar[str] = "float32"
+    signals: ClassVar[list[tuple[str, bool]]] = [("global", False), ("local", True)]
+    actions: ClassVar[Any] = None
+    observations: ClassVar[Any] = None
+    warnings: ClassVar[list[str]] = []
 
     @staticmethod
     def make(spec: dict[str, Any]) -> Any:
@@ -130,14 +140,16 @@ class Team:
         parts = "(observations, rewards, terminations, truncations, infos)"
         _count(result, 5, "step", parts)
         obs, rewards, terminations, truncations, _ = result
-        owing, left = self._owing[i], set()
+        owing, left, local = self._owing[i], set(), frame.rewards["local"][i]
         for name in acted:
-            frame.rewards[i, self._rows[name]] = _number(_said("reward", rewards, name))
+            local[self._rows[name]] = _number(_said("reward", rewards, name))
             terminated = bool(_said("termination", terminations, name))
             if terminated:
                 owing.discard(name)
+                frame.gone[i, self._rows[name]] = True
             if terminated or bool(_said("truncation", truncations, name)):
                 left.add(name)
+        frame.rewards["global"][i] = local.mean()
         here = [name for name in self._here(env) if name not in left]
         owing.update(here)
         # Who leaves may say a last word: the observation that a learner bootstraps from.
