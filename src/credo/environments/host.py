@@ -55,12 +55,14 @@ class AbstractCopies(abc.ABC):
     """`n` copies of one environment, stepped together."""
 
     n: int
+    failed: Bool[np.ndarray, " n"] | None = None
+    """Which active copies the last `reset` found broken: they have no episode. None: none."""
 
     @abc.abstractmethod
     def reset(self, seeds: UInt32[np.ndarray, " n"], active: Bool[np.ndarray, " n"]) -> np.ndarray:
         """A fresh episode in every active copy; its seed decides all that is random in it.
 
-        **Returns:** observations `[n, obs]`, of a team `[n, agents, obs]`, float32.
+        **Returns:** observations `[n, obs]`, of a team `[n, agents, obs]`, of the task's obs_dtype.
         """
 
     @abc.abstractmethod
@@ -68,6 +70,65 @@ class AbstractCopies(abc.ABC):
         self, actions: Float[np.ndarray, "n *agents act"], active: Bool[np.ndarray, " n"]
     ) -> HostStep:
         """One step of every active copy; the others cost nothing. Actions lie in [-1, 1]."""
+
+    def failure_text(self, i: int) -> str:
+        """Why the last episode of copy `i` that failed did."""
+        return "unknown"
+
+
+class InTurn(AbstractCopies):
+    """`n` copies of which no more play at the same time than `inner` has."""
+
+    def __init__(self, inner: AbstractCopies, n: int):
+        self.inner, self.n = inner, n
+        self._seats = np.zeros(0, np.int64)  # who plays
+        self._whys: dict[int, str] = {}
+
+    def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
+        """As for all copies, but whose episode is not over and who is not active loses it."""
+        self._seats = lanes = np.flatnonzero(active)
+        if lanes.size > self.inner.n:
+            raise ValueError(
+                f"{lanes.size} episodes were to begin at once: at_once allows {self.inner.n}, so "
+                "play them in turn"
+            )
+        some = self._some(np.asarray(seeds, np.uint32))
+        obs = self.inner.reset(some, np.arange(self.inner.n) < lanes.size)
+        self.failed = None if self.inner.failed is None else self._all(self.inner.failed)
+        self._keep(self.failed)
+        return self._all(obs)
+
+    def step(self, actions: np.ndarray, active: np.ndarray) -> HostStep:
+        if not np.isin(np.flatnonzero(active), self._seats).all():
+            raise ValueError("a step was asked of a copy that is not playing: reset it first")
+        now = self.inner.step(self._some(actions), self._some(active))
+        said = {name: getattr(now, name) for name in _PARTS}
+        said = {name: x if x is None else self._all(x) for name, x in said.items()}
+        rewards = {name: self._all(reward) for name, reward in now.rewards.items()}
+        self._keep(said["failed"])
+        return HostStep(rewards=rewards, **said)
+
+    def failure_text(self, i: int) -> str:
+        return self._whys.get(i, "unknown")
+
+    def _some(self, x: np.ndarray) -> np.ndarray:
+        """What is said to those who play, in the order of their seats."""
+        some = np.zeros((self.inner.n, *np.shape(x)[1:]), np.asarray(x).dtype)
+        some[: self._seats.size] = np.asarray(x)[self._seats]
+        return some
+
+    def _all(self, x: np.ndarray) -> np.ndarray:
+        rows = np.zeros((self.n, *x.shape[1:]), x.dtype)
+        rows[self._seats] = x[: self._seats.size]
+        return rows
+
+    def _keep(self, failed: np.ndarray | None) -> None:
+        for seat, lane in enumerate(self._seats.tolist()):
+            if failed is not None and failed[lane]:
+                self._whys[lane] = self.inner.failure_text(seat)
+
+
+_PARTS = ("obs", "terminated", "truncated", "active", "failed", "gone")
 
 
 class AbstractHostEnvironment(eqx.Module):
@@ -86,7 +147,16 @@ class AbstractHostEnvironment(eqx.Module):
     agents: ClassVar[int | None] = None
     discrete: ClassVar[bool] = False  # the largest of an action's entries is taken
     obs_dtype: ClassVar[str] = "float32"  # or "uint8"
-    at_once: ClassVar[int | None] = None  # most copies that play at the same time; None: all
+
+    @property
+    def at_once(self) -> int | None:
+        """Most copies that play at the same time; None: all. A field of those that can choose."""
+        return None
+
+    def turns(self, active: Bool[np.ndarray, " n"]) -> list[Bool[np.ndarray, " n"]]:
+        """Who of the active copies plays together, in order: all, or `at_once` at a time."""
+        turn = (np.cumsum(active) - 1) // (self.at_once or active.size)
+        return [active & (turn == k) for k in range(max(turn.max(), 0) + 1)]
 
     @property
     def reported(self) -> str:
