@@ -70,8 +70,23 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
         return self._sizes()["max_steps"]
 
     @property
+    def obs_dtype(self) -> str:
+        return self._sizes()["obs_dtype"]
+
+    @property
     def discrete(self) -> bool:
         return bool(self._sizes()["discrete"])
+
+    def spec(self) -> dict[str, Any]:
+        """What a worker must know to open it, as JSON has it."""
+        return {
+            "api": self.api,
+            "id": self.id,
+            "kwargs": dict(self.kwargs),
+            "max_episode_steps": self.max_episode_steps,
+            "rewards": [],
+            "registered": None,
+        }
 
     def copies(self, n: int) -> "ForeignCopies":
         if n < 1:
@@ -98,19 +113,13 @@ class ForeignCopies(AbstractCopies):
 
     def __init__(self, env: AbstractForeignEnvironment, n: int):
         self.n, self._id = n, env.id
-        spec = {
-            "api": env.api,
-            "id": env.id,
-            "kwargs": dict(env.kwargs),
-            "max_episode_steps": env.max_episode_steps,
-        }
         self._seeds, self._steps = np.zeros(n, np.uint32), np.zeros(n, np.int64)
         self._backend: worker.Environments | worker.Process | None = None
         try:
             if env.in_process:
-                self._backend = worker.Environments(spec, n)
+                self._backend = worker.Environments(env.spec(), n)
             else:
-                self._backend = worker.Process(spec, n, env.timeout)
+                self._backend = worker.Process(env.spec(), n, env.timeout)
         except worker.Fault as fault:
             raise UnfitEnvironment(f"{env.id} {fault.what}: {fault.fix}") from fault
         _SIZES[env] = sizes = self._backend.sizes()
@@ -133,11 +142,10 @@ class ForeignCopies(AbstractCopies):
         active = _form(active, (self.n,), np.bool_)
         self._steps += active
         frame = self._call("step", actions, active)
+        ended = frame.terminated | frame.truncated
+        acting = None if frame.active is None else frame.active & ~ended[:, None]
         ends = (frame.terminated, frame.truncated)
-        if frame.active is None:
-            return HostStep(frame.obs, {"reward": frame.rewards}, *ends)
-        rewards = {"global": frame.rewards.mean(axis=1), "local": frame.rewards}
-        return HostStep(frame.obs, rewards, *ends, frame.active & ~(ends[0] | ends[1])[:, None])
+        return HostStep(frame.obs, frame.rewards, *ends, acting, frame.failed, frame.gone)
 
     def _call(self, name: str, *arguments: np.ndarray) -> worker.Frame:
         if self._backend is None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, UInt32
+from jaxtyping import Bool, Float, Shaped, UInt32
 
 
 class EnvironmentFailure(RuntimeError):
@@ -38,13 +38,17 @@ class HostStep:
     For a team, observations and private rewards have an axis of agents, and `active` says who acts
     at the next step. An agent that leaves has its last reward and observation in that very step;
     while it is away both are 0.
+
+    In a copy that `failed` the episode broke in this step: it is over, and worth nothing.
     """
 
-    obs: Float[np.ndarray, "n *agents obs"]
+    obs: Shaped[np.ndarray, "n *agents obs"]  # float32, or uint8 if the task's obs_dtype says so
     rewards: dict[str, Float[np.ndarray, "n *agents"]]
     terminated: Bool[np.ndarray, " n"]  # the task ended: do not bootstrap
     truncated: Bool[np.ndarray, " n"]  # the clock ran out: do bootstrap
     active: Bool[np.ndarray, "n agents"] | None = None
+    failed: Bool[np.ndarray, " n"] | None = None  # None: no copy did
+    gone: Bool[np.ndarray, "n agents"] | None = None  # this agent itself terminated in this step
 
 
 class AbstractCopies(abc.ABC):
@@ -81,6 +85,8 @@ class AbstractHostEnvironment(eqx.Module):
         signals: eqx.AbstractVar[tuple[str, ...]]  # names of the rewards, as in a JAX task
     agents: ClassVar[int | None] = None
     discrete: ClassVar[bool] = False  # the largest of an action's entries is taken
+    obs_dtype: ClassVar[str] = "float32"  # or "uint8"
+    at_once: ClassVar[int | None] = None  # most copies that play at the same time; None: all
 
     @property
     def reported(self) -> str:

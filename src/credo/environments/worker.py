@@ -29,29 +29,48 @@ from .adapters import APIS, Fault
 
 HEADER = struct.Struct("=II")  # kind, bytes that follow
 OPEN, RESET, STEP, FRAME, FAULT = range(5)
+SIZES = (
+    "obs_size",
+    "obs_dtype",
+    "action_size",
+    "max_steps",
+    "discrete",
+    "agents",
+    "signals",
+    "actions",
+    "observations",
+    "warnings",
+)
 GRACE = 2.0  # seconds that environments get to close themselves
 
 
 class Frame:
     """What `n` copies say, as arrays that look into the bytes of one message.
 
-    For a team rewards and observations have an axis of agents, and `active` says who acts next.
+    `sizes` is what `Environments.sizes` says. Observations are float32 or uint8; `rewards` has an
+    array per signal, float64, `[n]` or, of one that is private to each agent, `[n, agents]`.
+    `failed`: the copy's episode broke in this call, and its row is 0. For a team observations have
+    an axis of agents, `active` says who acts next, and `gone` who terminated with this step.
     """
 
-    def __init__(self, n: int, obs_size: int, agents: int | None):
-        rows = n * (agents or 1)
+    def __init__(self, n: int, sizes: dict[str, Any]):
+        agents, dtype = sizes["agents"], np.dtype(sizes["obs_dtype"])
         team = (n,) if agents is None else (n, agents)
-        obs = HEADER.size + 8 * rows
-        flags = obs + 4 * rows * obs_size
-        self.buffer = bytearray(flags + 2 * n + (0 if agents is None else rows))
+        rewards = [(name, team if private else (n,)) for name, private in sizes["signals"]]
+        parts = [(shape, np.dtype(np.float64)) for _, shape in rewards]
+        parts.append(((*team, sizes["obs_size"]), dtype))
+        flags = [(n,)] * 3 + ([] if agents is None else [team] * 2)
+        parts += [(shape, np.dtype(np.bool_)) for shape in flags]
+        lengths = [math.prod(shape) * dtype.itemsize for shape, dtype in parts]
+        self.buffer = bytearray(HEADER.size + sum(lengths))
         HEADER.pack_into(self.buffer, 0, FRAME, len(self.buffer) - HEADER.size)
-        self.rewards = np.ndarray(team, np.float64, self.buffer, HEADER.size)
-        self.obs = np.ndarray((*team, obs_size), np.float32, self.buffer, obs)
-        self.terminated = np.ndarray(n, np.bool_, self.buffer, flags)
-        self.truncated = np.ndarray(n, np.bool_, self.buffer, flags + n)
-        self.active = None
-        if agents is not None:
-            self.active = np.ndarray(team, np.bool_, self.buffer, flags + 2 * n)
+        arrays, at = [], HEADER.size
+        for (shape, dtype), length in zip(parts, lengths, strict=True):
+            arrays.append(np.ndarray(shape, dtype, self.buffer, at))
+            at += length
+        self.rewards = {name: arrays[k] for k, (name, _) in enumerate(rewards)}
+        self.obs, self.terminated, self.truncated, self.failed, *others = arrays[len(rewards) :]
+        self.active, self.gone = others or (None, None)
 
 
 class Environments:
@@ -71,14 +90,14 @@ class Environments:
                 self.current[0] = i
                 self._envs.append(api.make(spec))
             self._api = api(self._envs[0], spec["max_episode_steps"])
-        self.obs_size, self.action_size = self._api.obs_size, self._api.action_size
+        self._sizes = {name: getattr(self._api, name) for name in SIZES}
         self.agents, self.max_steps = self._api.agents, self._api.max_steps
-        self.discrete = self._api.discrete
+        self.action_size = self._api.action_size
         self._steps = [-1] * n  # in this episode; -1: there is none
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> Frame:
         """Seeds `[n]`, uint32; active `[n]`."""
-        frame = Frame(self.n, self.obs_size, self.agents)
+        frame = Frame(self.n, self._sizes)
         with _blaming():
             for i in active.nonzero()[0].tolist():
                 self.current[0] = i
@@ -90,7 +109,7 @@ class Environments:
     def step(self, actions: np.ndarray, active: np.ndarray) -> Frame:
         """Actions `[n, act]`, of a team `[n, agents, act]`, in [-1, 1], clipped to it; active
         `[n]`."""
-        frame = Frame(self.n, self.obs_size, self.agents)
+        frame = Frame(self.n, self._sizes)
         with _blaming():
             self._given(actions, active)
             own, step, steps = self._api.read(actions), self._api.step, self._steps
@@ -118,20 +137,19 @@ class Environments:
 
     def _finite(self, frame: Frame) -> None:
         """One look at all copies; rows of those that are not active are 0."""
-        if np.isfinite(frame.obs).all() and np.isfinite(frame.rewards).all():
+        parts = (frame.obs, *frame.rewards.values())
+        if all(np.isfinite(x).all() for x in parts):
             return
-        obs, rewards = (x.reshape(self.n, -1) for x in (frame.obs, frame.rewards))
-        good = np.isfinite(obs).all(axis=1) & np.isfinite(rewards).all(axis=1)
-        self.current[0] = i = int(np.flatnonzero(~good)[0])
-        told = "the reward" if np.isfinite(frame.obs[i]).all() else "an observation"
+        good = [np.isfinite(x.reshape(self.n, -1)).all(axis=1) for x in parts]
+        self.current[0] = i = int(np.flatnonzero(~np.all(good, axis=0))[0])
+        told = "the reward" if good[0][i] else "an observation"
         raise Fault(
             f"returned NaN or inf in {told}",
             "guard the division, root or logarithm it is from, or end the episode before",
         )
 
     def sizes(self) -> dict[str, Any]:
-        names = ("obs_size", "action_size", "max_steps", "discrete", "agents")
-        return {name: getattr(self, name) for name in names}
+        return self._sizes
 
     usable = True
 
@@ -189,7 +207,6 @@ class Process:
             self.close(grace=0.0)
             raise
         self._sizes = json.loads(reply[HEADER.size :])
-        self.obs_size, self.action_size = self._sizes["obs_size"], self._sizes["action_size"]
 
     def sizes(self) -> dict[str, Any]:
         return self._sizes
@@ -205,7 +222,7 @@ class Process:
         return self._call(STEP, actions, active)
 
     def _call(self, kind: int, numbers: np.ndarray, active: np.ndarray) -> Frame:
-        frame = Frame(self.n, self.obs_size, self._sizes["agents"])
+        frame = Frame(self.n, self._sizes)
         payload = numbers.tobytes() + active.tobytes()
         self._ask(HEADER.pack(kind, len(payload)) + payload, frame.buffer)
         return frame

@@ -1,5 +1,7 @@
 """Tasks made of other tasks."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -221,7 +223,7 @@ class DelayedCopies(AbstractCopies):
             lanes = (-1,) + (1,) * (earned.ndim - 1)
             np.add(earned, now.rewards[name], out=earned, where=active.reshape(lanes))
             paid[name] = np.where((ended & active).reshape(lanes), earned, 0.0)
-        return HostStep(now.obs, paid, now.terminated, now.truncated, now.active)
+        return dataclasses.replace(now, rewards=paid)
 
 
 _DELAYED: dict[tuple[DelayedHostReward, int], DelayedCopies] = {}
