@@ -5,12 +5,13 @@
 
 import atexit
 import os
+import warnings
 from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
 
-from . import worker
+from . import names, worker
 from .host import (
     AbstractCopies,
     AbstractHostEnvironment,
@@ -84,9 +85,43 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
             "id": self.id,
             "kwargs": dict(self.kwargs),
             "max_episode_steps": self.max_episode_steps,
-            "rewards": [],
-            "registered": None,
+            "registered": names.registered(self.id) if self.api == "gymnasium" else None,
+            **self._paid(),
         }
+
+    def _paid(self) -> dict[str, Any]:
+        """Of a team: pairs of a reward and of what pays it, and which rewards all share."""
+        return {"rewards": [], "shared": []}
+
+    @property
+    def foreign_code(self) -> str | None:
+        """Whose code opening this would import, by name; None for what Gymnasium, PettingZoo, MPE2
+        and Credo themselves have."""
+        makers = (at for _, at in self._paid()["rewards"])
+        return names.foreign_code(self.api, self.id, dict(self.kwargs)) or next(makers, None)
+
+    @property
+    def here(self) -> bool:
+        """Whether it is played in this process: asked for, or because no other can import it."""
+        return self.in_process or names.here_alone(self.id)
+
+    def task_record(self) -> dict[str, Any]:
+        """What a run records of its task, so that a policy acts in the task's units without it."""
+        return {name: self._sizes()[name] for name in RECORDED}
+
+    @property
+    def obs_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the largest of each observed number, `[*agents, obs]`, as the observation
+        space says; no one looks whether they are kept but `check_environment`."""
+        said, size = self._sizes()["obs_range"], self.obs_size
+        if self.agents is None:
+            low, high = (np.broadcast_to(np.float32(x), (size,)) for x in said)
+        else:
+            low, high = (
+                np.stack([np.broadcast_to(np.float32(x), (size,)) for x in column])
+                for column in zip(*said, strict=True)
+            )
+        return low, high
 
     def copies(self, n: int) -> "ForeignCopies":
         if n < 1:
@@ -96,13 +131,26 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
             _OPEN.pop(key).close()
         if key not in _OPEN:
             _OPEN[key] = ForeignCopies(self, n)
+            self._warn()
         return _OPEN[key]
 
     def _sizes(self) -> dict[str, Any]:
         """What only the environment itself can tell: it is opened for this, once."""
         if self not in _SIZES:
             ForeignCopies(self, 1).close()
+            self._warn()
         return _SIZES[self]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What its users should know, although it can be played."""
+        return tuple(self._sizes()["warnings"])
+
+    def _warn(self) -> None:
+        if self not in _WARNED:
+            _WARNED.add(self)
+            for told in self.warnings:
+                warnings.warn(f"{self.id}: {told}", stacklevel=4)
 
 
 class ForeignCopies(AbstractCopies):
@@ -116,7 +164,7 @@ class ForeignCopies(AbstractCopies):
         self._seeds, self._steps = np.zeros(n, np.uint32), np.zeros(n, np.int64)
         self._backend: worker.Environments | worker.Process | None = None
         try:
-            if env.in_process:
+            if env.here:
                 self._backend = worker.Environments(env.spec(), n)
             else:
                 self._backend = worker.Process(env.spec(), n, env.timeout)
@@ -177,7 +225,9 @@ def _form(x: np.ndarray, shape: tuple[int, ...], dtype: type) -> np.ndarray:
     return x
 
 
+RECORDED = ("obs_size", "action_size", "agents", "discrete", "actions", "observations")
 _OPEN: dict[tuple[AbstractForeignEnvironment, int], ForeignCopies] = {}
+_WARNED: set[AbstractForeignEnvironment] = set()
 _SIZES: dict[AbstractForeignEnvironment, dict[str, Any]] = {}
 
 

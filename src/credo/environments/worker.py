@@ -39,6 +39,7 @@ SIZES = (
     "signals",
     "actions",
     "observations",
+    "obs_range",
     "warnings",
 )
 GRACE = 2.0  # seconds that environments get to close themselves
@@ -89,7 +90,9 @@ class Environments:
             for i in range(n):
                 self.current[0] = i
                 self._envs.append(api.make(spec))
-            self._api = api(self._envs[0], spec["max_episode_steps"])
+        with _blaming():
+            self.current[0] = 0
+            self._api = api(self._envs[0], spec)
         self._sizes = {name: getattr(self._api, name) for name in SIZES}
         self.agents, self.max_steps = self._api.agents, self._api.max_steps
         self.action_size = self._api.action_size
