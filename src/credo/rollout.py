@@ -92,15 +92,16 @@ def score(
 def blank(env: Environment) -> Transition:
     """A transition of this task, all zeros: its shapes and types."""
     obs_size, action_size, *team = env.sizes
-    obs, action, ended = jnp.zeros((*team, obs_size)), jnp.zeros((*team, action_size)), jnp.bool_(0)
+    obs = jnp.zeros((*team, obs_size), getattr(env, "obs_dtype", "float32"))
+    action = jnp.zeros((*team, action_size))
     if isinstance(env, AbstractHostEnvironment):
         rewards = {name: jnp.zeros(shape) for name, shape in env.reward_shapes.items()}
-        active = jnp.zeros(team, bool) if team else None
+        ended, active = jnp.zeros(team, bool), jnp.zeros(team, bool) if team else None
     else:
         _, first = jax.eval_shape(lambda: env.reset(key=jax.random.key(0)))
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), first)
-        rewards, active = zeros.rewards, zeros.active
-    return Transition(obs, action, rewards, obs, ended, ended, active)
+        rewards, ended, active = zeros.rewards, zeros.ended, zeros.active
+    return Transition(obs, action, rewards, obs, ended, jnp.bool_(False), active)
 
 
 def world_keys(pop: int, episodes: int, common: bool, *, key: PRNGKeyArray) -> PRNGKeyArray:
@@ -180,8 +181,8 @@ def _play(
         )
         steps = steps + active.astype(jnp.int32)
         if record:
-            ends = (step.terminated, step.truncated)
-            row = (Transition(obs, actions, step.rewards, step.obs, *ends, acting), active)
+            ends = (step.ended, step.truncated, acting)
+            row = (Transition(obs, actions, step.rewards, step.obs, *ends), active)
             rows = jax.tree.map(lambda xs, x: xs.at[t].set(x), rows, row)
         active = active & ~(step.terminated | step.truncated)
         seen = (step.obs, step.active)
@@ -242,8 +243,8 @@ def _play_on_host(
             totals[name] += np.where(_over(active, reward), reward, 0.0)
         steps += active
         if record:
-            ends = (step.terminated, step.truncated)
-            rows.append((obs, action, step.rewards, step.obs, *ends, acting))
+            ends = (step.ended, step.truncated, acting)
+            rows.append((obs, action, step.rewards, step.obs, *ends))
             valid.append(active)
         active = active & ~(step.terminated | step.truncated)
         obs, acting = step.obs, step.active

@@ -7,13 +7,14 @@ import atexit
 import collections
 import os
 import threading
+import warnings
 import weakref
 from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
 
-from . import processes, worker
+from . import names, processes, worker
 from .host import (
     AbstractCopies,
     AbstractHostEnvironment,
@@ -98,9 +99,43 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
             "id": self.id,
             "kwargs": dict(self.kwargs),
             "max_episode_steps": self.max_episode_steps,
-            "rewards": [],
-            "registered": None,
+            "registered": names.registered(self.id) if self.api == "gymnasium" else None,
+            **self._paid(),
         }
+
+    def _paid(self) -> dict[str, Any]:
+        """Of a team: pairs of a reward and of what pays it, and which rewards all share."""
+        return {"rewards": [], "shared": []}
+
+    @property
+    def foreign_code(self) -> str | None:
+        """Whose code opening this would import, by name; None for what Gymnasium, PettingZoo, MPE2
+        and Credo themselves have."""
+        makers = (at for _, at in self._paid()["rewards"])
+        return names.foreign_code(self.api, self.id, dict(self.kwargs)) or next(makers, None)
+
+    @property
+    def here(self) -> bool:
+        """Whether it is played in this process: asked for, or because no other can import it."""
+        return self.in_process or names.here_alone(self.id)
+
+    def task_record(self) -> dict[str, Any]:
+        """What a run records of its task, so that a policy acts in the task's units without it."""
+        return {name: self._sizes()[name] for name in RECORDED}
+
+    @property
+    def obs_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the largest of each observed number, `[*agents, obs]`, as the observation
+        space says; no one looks whether they are kept but `check_environment`."""
+        said, size = self._sizes()["obs_range"], self.obs_size
+        if self.agents is None:
+            low, high = (np.broadcast_to(np.float32(x), (size,)) for x in said)
+        else:
+            low, high = (
+                np.stack([np.broadcast_to(np.float32(x), (size,)) for x in column])
+                for column in zip(*said, strict=True)
+            )
+        return low, high
 
     def copies(self, n: int) -> "ForeignCopies | InTurn":
         """`n` copies, kept open for the life of this thread: asking again returns the same. With
@@ -112,13 +147,26 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
             kept.pop((self, some)).close()
         if (self, some) not in kept:
             kept[self, some] = ForeignCopies(self, some)
+            self._warn()
         return kept[self, some] if self.at_once is None else InTurn(kept[self, some], n)
 
     def _sizes(self) -> dict[str, Any]:
         """What only the environment itself can tell: it is opened for this, once."""
         if self not in _SIZES:
             ForeignCopies(self, 1).close()
+            self._warn()
         return _SIZES[self]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What its users should know, although it can be played."""
+        return tuple(self._sizes()["warnings"])
+
+    def _warn(self) -> None:
+        if self not in _WARNED:
+            _WARNED.add(self)
+            for told in self.warnings:
+                warnings.warn(f"{self.id}: {told}", stacklevel=4)
 
 
 class ForeignCopies(AbstractCopies):
@@ -146,9 +194,8 @@ class ForeignCopies(AbstractCopies):
         if self._backend is None:
             env, spec = self._env, self._env.spec()
             processes.allow()
-            prompt = env.id.startswith("__main__:") and worker.script_of(env.id) is None
             try:
-                if env.in_process or prompt:  # no worker could load it
+                if env.here:
                     self._backend = worker.Environments(spec, self.n)
                 else:
                     self._backend = worker.Process(spec, self.n, env.timeout)
@@ -270,6 +317,10 @@ def _form(x: np.ndarray, shape: tuple[int, ...], dtype: type) -> np.ndarray:
     if x.shape != shape:
         raise ValueError(f"an array of shape {x.shape} was given: it must be {shape}")
     return x
+
+
+RECORDED = ("obs_size", "action_size", "agents", "discrete", "actions", "observations")
+_WARNED: set[AbstractForeignEnvironment] = set()
 
 
 class _Kept(threading.local):

@@ -50,6 +50,14 @@ class HostStep:
     failed: Bool[np.ndarray, " n"] | None = None  # None: no copy did
     gone: Bool[np.ndarray, "n agents"] | None = None  # this agent itself terminated in this step
 
+    @property
+    def ended(self) -> Bool[np.ndarray, "n *agents"]:
+        """For whom the task ended: do not bootstrap. Of a team by agent."""
+        if self.active is None:
+            return self.terminated
+        ended = np.repeat(self.terminated[:, None], self.active.shape[1], axis=1)
+        return ended if self.gone is None else ended | self.gone
+
 
 class AbstractCopies(abc.ABC):
     """`n` copies of one environment, stepped together."""
@@ -147,6 +155,11 @@ class AbstractHostEnvironment(eqx.Module):
     agents: ClassVar[int | None] = None
     discrete: ClassVar[bool] = False  # the largest of an action's entries is taken
     obs_dtype: ClassVar[str] = "float32"  # or "uint8"
+    if TYPE_CHECKING:
+        obs_range: ClassVar[tuple[Any, Any]]
+    else:
+        obs_range = (-np.inf, np.inf)  # the least and the largest of the observed numbers
+    warnings: ClassVar[tuple[str, ...]] = ()  # what its users should know
 
     @property
     def at_once(self) -> int | None:
@@ -173,6 +186,13 @@ class AbstractHostEnvironment(eqx.Module):
     def reward_shapes(self) -> dict[str, tuple[int, ...]]:
         """Of each reward of one copy: () or, of one that is private to each agent, (agents,)."""
         return dict.fromkeys(self.signals, ())
+
+    def task_record(self) -> dict[str, Any]:
+        """What a run records of its task; `actions`: how the task itself takes an action, None
+        for numbers in [-1, 1] as they are."""
+        agents = {"agents": self.agents, "discrete": self.discrete}
+        sizes = {"obs_size": self.obs_size, "action_size": self.action_size}
+        return {**sizes, **agents, "actions": None, "observations": None}
 
     @abc.abstractmethod
     def copies(self, n: int) -> AbstractCopies:

@@ -11,7 +11,6 @@ import json
 import math
 import mmap
 import os
-import runpy
 import select
 import signal
 import struct
@@ -38,6 +37,7 @@ SIZES = (
     "signals",
     "actions",
     "observations",
+    "obs_range",
     "warnings",
 )
 GRACE = 2.0  # seconds that environments get to close themselves
@@ -110,21 +110,18 @@ class Environments:
     it is being opened: they may lie in memory shared with whoever must know.
     """
 
-    def __init__(
-        self, spec: dict[str, Any], n: int, current: Any = None, script: list[str] | None = None
-    ):
+    def __init__(self, spec: dict[str, Any], n: int, current: Any = None):
         self._alone = current is not None  # nobody's Ctrl-C is meant for this process
         self.current = [0, 0] if current is None else current
         self.n, self._spec, self._envs = n, spec, []
         self._kind = APIS[spec.get("api", "gymnasium")]
         try:
-            _load(script)
             for i in range(n):
                 self._envs.append(self._open(i))
-            self._api = self._kind(self._envs[0], spec["max_episode_steps"])
+            self._api = self._kind(self._envs[0], spec)
         except BaseException as error:
             self.close()
-            raise self._fault(error, LOOK) from error
+            raise self._fault(error, LOOK if len(self._envs) < n else MEND) from error
         self._sizes = {name: getattr(self._api, name) for name in SIZES}
         self._blank = Frame(n, self._sizes)
         self.agents, self.max_steps = self._api.agents, self._api.max_steps
@@ -269,7 +266,7 @@ class Process:
         self._writable.register(self._out, select.POLLOUT)
         if self._process.ending is not None:
             self._readable.register(self._process.ending, select.POLLIN)
-        message = _message(OPEN, {"spec": spec, "n": n, "script": script_of(spec["id"])})
+        message = _message(OPEN, {"spec": spec, "n": n})
         try:
             self._sizes = json.loads(self._ask(message, bytearray(HEADER.size))[HEADER.size :])
         except BaseException:
@@ -383,29 +380,6 @@ def _start(*descriptors: int) -> processes.Child:
     arguments = [str(number) for number in descriptors]
     environment = {**threads, **os.environ}
     return processes.Child(__name__, *arguments, env=environment, stdout=2, pass_fds=descriptors)
-
-
-def script_of(id: str) -> list[str] | None:
-    """Of a class of the program that runs: how a worker can load it, as ["file", path] or, after
-    `python -m`, ["module", name]. None of any other, and of one from a prompt or a notebook."""
-    main = sys.modules["__main__"]
-    module, path = getattr(main, "__spec__", None), getattr(main, "__file__", None)
-    if id.partition(":")[0] != "__main__":
-        return None
-    if module is not None:
-        return ["module", module.name]
-    return ["file", os.path.abspath(path)] if path and os.path.exists(path) else None
-
-
-def _load(script: list[str] | None) -> None:
-    """The parent's program as `__main__`, without what it guards by that name."""
-    if script is None:
-        return
-    kind, where = script
-    run = runpy.run_path if kind == "file" else runpy.run_module
-    main = type(sys)("__mp_main__")
-    main.__dict__.update(run(where, run_name="__mp_main__"))
-    sys.modules["__main__"] = sys.modules["__mp_main__"] = main
 
 
 def _serve(requests: int, replies: int, current: memoryview) -> None:

@@ -115,7 +115,7 @@ class NoisyObservations(AbstractWrapper):
         noisy = jnp.arange(self.obs_size) < self.obs_size - self.spared
         noise = self.std * jax.random.normal(key, now.obs.shape)
         obs = now.obs + jnp.where(noisy, noise, 0.0)
-        return TimeStep(obs, now.rewards, now.terminated, now.truncated, now.active)
+        return dataclasses.replace(now, obs=obs)
 
 
 def delayed(
@@ -154,8 +154,7 @@ class DelayedReward(AbstractWrapper):
         earned = {name: state.earned[name] + reward for name, reward in now.rewards.items()}
         ended = now.terminated | now.truncated
         paid = {name: jnp.where(ended, sum_, 0.0) for name, sum_ in earned.items()}
-        now = TimeStep(now.obs, paid, now.terminated, now.truncated, now.active)
-        return DelayedState(inner, earned), now
+        return DelayedState(inner, earned), dataclasses.replace(now, rewards=paid)
 
 
 class DelayedHostReward(AbstractHostEnvironment):
@@ -206,6 +205,17 @@ class DelayedHostReward(AbstractHostEnvironment):
     @property
     def at_once(self) -> int | None:
         return self.env.at_once
+
+    @property
+    def obs_range(self):
+        return self.env.obs_range
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        return self.env.warnings
+
+    def task_record(self):
+        return self.env.task_record()
 
     def copies(self, n: int) -> "DelayedCopies":
         inner = self.env.copies(n)
