@@ -182,6 +182,7 @@ class ForeignCopies(AbstractCopies):
         self._seeds, self._steps = np.zeros(n, np.uint32), np.zeros(n, np.int64)
         self._running = np.zeros(n, bool)  # in an episode
         self._stranded = np.zeros(n, bool)  # in one that was lost with the worker
+        self._broken = np.zeros(n, bool)  # whose episode has failed
         self._recent: collections.deque[str] = collections.deque(maxlen=100)  # why it failed, or ""
         self._whys: dict[int, str] = {}
         self._backend: worker.Environments | worker.Process | None = None
@@ -220,7 +221,7 @@ class ForeignCopies(AbstractCopies):
         seeds = _form(seeds, (self.n,), np.uint32)
         active = _form(active, (self.n,), np.bool_)
         np.copyto(self._seeds, seeds, where=active)
-        self._steps[active], self._stranded[active] = 0, False
+        self._steps[active], self._stranded[active], self._broken[active] = 0, False, False
         self._running |= active
         frame, self.failed = self._call("reset", seeds, active)
         return frame.obs
@@ -228,6 +229,9 @@ class ForeignCopies(AbstractCopies):
     def step(self, actions: np.ndarray, active: np.ndarray) -> HostStep:
         actions = _form(actions, self._actions, np.float32)
         active = _form(active, (self.n,), np.bool_)
+        over = active & self._broken
+        if over.any():  # whoever asked takes no notice of `failed`
+            raise EnvironmentFailure(self.failure_text(int(over.argmax())))
         self._steps += active
         frame, failed = self._call("step", actions, active)
         ended = frame.terminated | frame.truncated
@@ -266,6 +270,7 @@ class ForeignCopies(AbstractCopies):
             failed |= frame.failed
             self._running &= ~failed
             self._stranded &= ~failed
+            self._broken |= failed
         return frame, failed
 
     def _lost(self, name: str, asked: np.ndarray, backend: Any) -> np.ndarray:
