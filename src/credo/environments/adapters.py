@@ -47,7 +47,7 @@ class Single:
         function that makes one, or by an id that a module registers when it is imported:
         `package.module:Name-v0`."""
         id, kwargs, (module, _, name) = spec["id"], spec["kwargs"], spec["id"].partition(":")
-        if not name or names.find(id) is None and not names.here_alone(id):
+        if not name or (names.find(id) is None and not names.here_alone(id)):
             if name:
                 importlib.import_module(module)
             names.register(spec.get("registered"))

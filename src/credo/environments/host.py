@@ -63,6 +63,8 @@ class AbstractCopies(abc.ABC):
     """`n` copies of one environment, stepped together."""
 
     n: int
+    failed: Bool[np.ndarray, " n"] | None = None
+    """Which active copies the last `reset` found broken: they have no episode. None: none."""
 
     @abc.abstractmethod
     def reset(self, seeds: UInt32[np.ndarray, " n"], active: Bool[np.ndarray, " n"]) -> np.ndarray:
@@ -76,6 +78,10 @@ class AbstractCopies(abc.ABC):
         self, actions: Float[np.ndarray, "n *agents act"], active: Bool[np.ndarray, " n"]
     ) -> HostStep:
         """One step of every active copy; the others cost nothing. Actions lie in [-1, 1]."""
+
+    def failure_text(self, i: int) -> str:
+        """Why the last episode of copy `i` that failed did."""
+        return "unknown"
 
 
 class AbstractHostEnvironment(eqx.Module):
@@ -100,6 +106,11 @@ class AbstractHostEnvironment(eqx.Module):
         obs_range = (-np.inf, np.inf)  # the least and the largest of the observed numbers
     warnings: ClassVar[tuple[str, ...]] = ()  # what its users should know
     at_once: ClassVar[int | None] = None  # most copies that play at the same time; None: all
+
+    def turns(self, active: Bool[np.ndarray, " n"]) -> list[Bool[np.ndarray, " n"]]:
+        """Who of the active copies plays together, in order: all, or `at_once` at a time."""
+        turn = (np.cumsum(active) - 1) // (self.at_once or active.size)
+        return [active & (turn == k) for k in range(max(turn.max(), 0) + 1)]
 
     @property
     def reported(self) -> str:
