@@ -152,7 +152,11 @@ class Says(Tiny):
 
 SPACES = {
     "dict": gymnasium.spaces.Dict(
-        {"pos": Box(-1, 1, (2,)), "kind": Discrete(3), "sub": gymnasium.spaces.Tuple([Box(0, 9, ())])}
+        {
+            "pos": Box(-1, 1, (2,)),
+            "kind": Discrete(3),
+            "sub": gymnasium.spaces.Tuple([Box(0, 9, ())]),
+        }
     ),
     "box": Box(-1, 1, (2,)),
     "bytes": Box(0, 255, (2,), np.uint8),
@@ -203,9 +207,13 @@ class Masked(gymnasium.Env):
         mask = np.array([1, 0, 0, 1] if self.steps % 2 == 0 else [0, 1, 1, 0], np.int8)
         mask = mask * (self.steps != self.never)
         obs = {"x": np.zeros(1, np.float32)}
-        return (obs | {"action_mask": mask}, {}) if self.where == "obs" else (
-            obs,
-            {"action_mask": mask},
+        return (
+            (obs | {"action_mask": mask}, {})
+            if self.where == "obs"
+            else (
+                obs,
+                {"action_mask": mask},
+            )
         )
 
     def reset(self, *, seed=None, options=None):

@@ -1,6 +1,7 @@
 """Tasks made of other tasks."""
 
 import dataclasses
+import threading
 
 import equinox as eqx
 import jax
@@ -198,6 +199,14 @@ class DelayedHostReward(AbstractHostEnvironment):
         return self.env.reward_shapes
 
     @property
+    def obs_dtype(self) -> str:
+        return self.env.obs_dtype
+
+    @property
+    def at_once(self) -> int | None:
+        return self.env.at_once
+
+    @property
     def obs_range(self):
         return self.env.obs_range
 
@@ -210,15 +219,23 @@ class DelayedHostReward(AbstractHostEnvironment):
 
     def copies(self, n: int) -> "DelayedCopies":
         inner = self.env.copies(n)
-        if (self, n) not in _DELAYED or _DELAYED[self, n].inner is not inner:
-            _DELAYED[self, n] = DelayedCopies(inner, self.reward_shapes)
-        return _DELAYED[self, n]
+        kept = _DELAYED.copies
+        if (self, n) not in kept or kept[self, n].inner is not inner:
+            kept[self, n] = DelayedCopies(inner, self.reward_shapes)
+        return kept[self, n]
 
 
 class DelayedCopies(AbstractCopies):
     def __init__(self, inner: AbstractCopies, shapes: dict[str, tuple[int, ...]]):
         self.inner, self.n = inner, inner.n
         self._earned = {name: np.zeros((inner.n, *shape)) for name, shape in shapes.items()}
+
+    @property
+    def failed(self) -> np.ndarray | None:
+        return self.inner.failed
+
+    def failure_text(self, i: int) -> str:
+        return self.inner.failure_text(i)
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
         for earned in self._earned.values():
@@ -236,4 +253,11 @@ class DelayedCopies(AbstractCopies):
         return dataclasses.replace(now, rewards=paid)
 
 
-_DELAYED: dict[tuple[DelayedHostReward, int], DelayedCopies] = {}
+class _Kept(threading.local):
+    """Of each thread its own, as the copies inside are."""
+
+    def __init__(self):
+        self.copies: dict[tuple[DelayedHostReward, int], DelayedCopies] = {}
+
+
+_DELAYED = _Kept()
