@@ -25,6 +25,9 @@ TRAIN = (
 )
 
 
+MEAN = "mean ± standard error over episodes"
+
+
 @pytest.fixture(autouse=True)
 def as_it_was(monkeypatch):
     """A command may change the process that it thinks its own."""
@@ -106,7 +109,7 @@ def test_list_names_everything(credo):
         ("train neuroevolution nowhere:Task", "cannot import 'nowhere:Task'", "folder of its file"),
         ("train neuroevolution os:sep", "os:sep is no task", "derive it from credo.Abstract"),
         ("check os:getcwd", "os:getcwd is no task", "derive it from credo.AbstractEnvironment"),
-        ("check :Task", "no task ':Task'", "written package.module:Class"),
+        ("check :Task", "no task ':Task'", "written package.module:name"),
         ("check os:Nothing", "cannot import 'os:Nothing'", "folder of its file"),
         ("train neuroevolution sequence-recall --network lstn", "no network 'lstn'", "'lstm'?"),
         ("train neuroevolution sequence-recall --preset our", "no preset 'our'", "'ours'?"),
@@ -245,7 +248,7 @@ def test_evaluate_plays_fresh_episodes_of_any_depth(credo, run):
     code, out, _ = credo(f"evaluate {run} --episodes 40")
     assert code == 0
     lines = out.splitlines()
-    assert lines[0] == f"{run}: 40 fresh episodes"
+    assert lines[0] == f"{run}: 40 fresh episodes, {MEAN}"
     assert [line.split()[0] for line in lines[1:]] == [
         "fitness",
         "accuracy",
@@ -349,7 +352,7 @@ def test_it_is_resumed_evaluated_and_started_from(credo, hosted, tmp_path):
     assert out.startswith(f"{tmp_path / 'run'}: generation 6, best fitness ")
     code, out, _ = credo(f"evaluate {hosted} --max-episode-steps 7")
     lines = out.splitlines()
-    assert lines[0] == f"{hosted}: 20 fresh episodes"
+    assert lines[0] == f"{hosted}: 20 fresh episodes, {MEAN}"
     assert lines[1].split()[0] == "reward"
     assert lines[2].split() == ["steps", "7.0"]
     words = f"train td3 Pendulum-v1 {OFF_POLICY} --frames 10 --from {hosted}"
@@ -429,7 +432,7 @@ def test_a_package_that_registers_its_tasks_is_imported(credo, tmp_path, monkeyp
     assert (code, out) == (0, "registers_tasks:Swing/Mine-v3: 0 problems found\n")
     code, _, err = credo("check", "registers_nothing:Mine-v3")
     assert code == 2
-    assert "cannot import 'registers_nothing'" in err
+    assert "cannot import 'registers_nothing:Mine-v3'" in err
 
 
 def test_check_finds_nothing_wrong_with_a_good_task(credo, own_tasks):
@@ -534,7 +537,7 @@ def test_a_team_of_rovers_is_trained_with_the_flags_of_its_parts(credo, tmp_path
     assert run.metrics["updates"].max() > 0
     code, out, _ = credo(f"evaluate {path} --episodes 5")
     assert code == 0
-    assert out.splitlines()[0] == f"{path}: 5 fresh episodes"
+    assert out.splitlines()[0] == f"{path}: 5 fresh episodes, {MEAN}"
     assert {"global", "local"} <= {line.split()[0] for line in out.splitlines()[1:]}
     code, out, _ = credo(f"resume {path} --generations 4")
     assert code == 0

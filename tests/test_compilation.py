@@ -53,4 +53,4 @@ def test_results_are_float32_and_the_name_is_kept(traced):
 
 def test_the_cache_lies_where_the_user_said():
     compilation.enable_cache()
-    assert jax.config.jax_compilation_cache_dir == str(compilation.cache_directory / "xla")
+    assert jax.config.jax_compilation_cache_dir == str(compilation.cache_directory() / "xla")

@@ -3,6 +3,7 @@
 Nothing here imports JAX before a command needs it: `credo --help` answers at once.
 """
 
+import contextlib
 import dataclasses
 import importlib
 import os
@@ -11,9 +12,22 @@ import re
 import sys
 import traceback
 import warnings
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from .runs.arguments import fail, parse, plain_integer, pop_option, pop_switch, seconds
+from .runs import ending
+from .runs.arguments import (
+    fail,
+    in_range,
+    parse,
+    plain_integer,
+    pop_changes,
+    pop_option,
+    pop_pairs,
+    pop_switch,
+    seconds,
+)
+from .runs.ending import say
 
 
 class Entry(NamedTuple):
@@ -171,7 +185,8 @@ PRESETS = {
     "ours": "the best settings found: start here for a task of your own; of erl, for late rewards",
     "dmmu": "Algorithm 5: teams, whose agents change places too",
 }
-POPPED = ("--network", "--preset", "--delayed", "--from")  # flags that are no fields
+OF_TASKS = ("--kwargs", "--rewards")  # flags that are no fields
+POPPED = ("--network", "--preset", "--delayed", "--from", *OF_TASKS)
 COMMANDS = {
     "list": "tasks, algorithms, networks, presets and experiments",
     "train": "train an algorithm on a task: credo train neuroevolution sequence-classification",
@@ -186,8 +201,12 @@ COMMANDS = {
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Entry point of `credo`. Wrong use ends with a suggestion and exit code 2."""
-    argv = list(sys.argv[1:] if argv is None else argv)
+    """Entry point of `credo`. Whatever happens ends in a line and an exit code (see `ending`)."""
+    ending.open_streams()
+    ending.run(lambda: _command(list(sys.argv[1:] if argv is None else argv)))
+
+
+def _command(argv: list[str]) -> None:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(overview())
         return
@@ -200,16 +219,18 @@ def main(argv: list[str] | None = None) -> None:
     if command not in COMMANDS:
         fail(f"no command {command!r}", command, COMMANDS)
     rest = [plain_integer(token) for token in rest]
-    warnings.showwarning = lambda message, *_args, **_kw: print(
-        f"warning: {message}", file=sys.stderr
-    )
+    warnings.showwarning = lambda message, *_args, **_kw: say(f"warning: {message}")
     # Environments of users lie where they work.
-    sys.path.insert(0, os.getcwd())
+    sys.path.insert(0, _here())
+    globals()[f"_{command}"](rest)
+
+
+def _here() -> str:
     try:
-        globals()[f"_{command}"](rest)
-    except KeyboardInterrupt:
-        print("credo: stopped", file=sys.stderr)
-        raise SystemExit(130) from None
+        return os.getcwd()
+    except OSError as error:
+        say(f"credo: this folder is not there any more ({error.strerror}): go to another with cd")
+        raise SystemExit(1) from None
 
 
 def overview() -> str:
@@ -236,6 +257,8 @@ def _list(argv: list[str]) -> None:
         return
     if argv and argv[0] not in sections:
         fail(f"nothing called {argv[0]!r} to list", argv[0], sections)
+    if len(argv) > 1:
+        fail(f"credo list takes one word, and {argv[1]!r} is another")
     for title in argv[:1] or sections:
         print(title)
         width = max(map(len, sections[title])) + 2
@@ -244,8 +267,11 @@ def _list(argv: list[str]) -> None:
     if not argv or argv[0] == "tasks":
         print("  Hopper-v5, …            any task that Gymnasium knows and whose actions are a box")
         print("  mpe2.simple_spread_v3   any team of PettingZoo (ParallelEnv) with Box actions")
-        print("  package.module:Class    a task of your own (see examples/own_environment.py), or")
-        print("                          a gymnasium.Env or pettingzoo.ParallelEnv class")
+        print("  package.module:name     a task of your own (see examples/own_environment.py): its")
+        print(
+            "                          class, a gymnasium.Env or pettingzoo.ParallelEnv class, or"
+        )
+        print("                          a function that makes one of these two")
 
 
 @dataclasses.dataclass
@@ -253,7 +279,9 @@ class TrainOptions:
     """The run.
 
     Beside the flags below: --network NAME, --preset NAME, --delayed (the task pays the whole return
-    at its last step), --from RUN (start from the champion of another run).
+    at its last step), --from RUN (start from the champion of another run); of tasks of Gymnasium
+    and PettingZoo --kwargs NAME=VALUE … (what they are made with), and of teams
+    --rewards NAME=MODULE:FUNCTION … (rewards of your own).
     """
 
     generations: int | None = None  # budget; with no budget given, the algorithm's own
@@ -282,7 +310,8 @@ def _train(argv: list[str]) -> None:
     delayed, argv = pop_switch(argv, "--delayed")
     if network_name and network_name not in NETWORKS:
         fail(f"no network {network_name!r}", network_name, NETWORKS)
-    env = _limited(_task(names[1]), argv)
+    settings, argv = _settings(argv)
+    env = _limited(_task(names[1], settings), argv)
     build, network = _builder(names[0], preset), None
     if network_name:
         path, fields, _ = NETWORKS[network_name]
@@ -296,16 +325,14 @@ def _train(argv: list[str]) -> None:
 
         env = wrappers.delayed(env)
     algorithm, options = _configured(prog, build, env, network, argv)
+    in_range(options, options.seeds)
     _require_sound(names[1], algorithm.env)
-    for name in ("generations", "frames", "seeds", "keep"):
-        if getattr(options, name) is not None and getattr(options, name) < 1:
-            fail(f"--{name} is {getattr(options, name)}: it must be at least 1")
     fields = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     fields |= {"wall_clock": seconds(options.wall_clock), "warm_start": warm_start or None}
     label = _label(names[0], names[1]) + "-delayed" * delayed
     if not warm_start:
         _note_start(algorithm, options.frames)
-    _guarded(lambda: _start(algorithm, label, **fields))
+    _start(algorithm, label, **fields)
 
 
 def _limited(env: Any, argv: list[str]) -> Any:
@@ -329,13 +356,14 @@ def _on_a_team(algorithm: str, env: Any, network: Any) -> Any:
 
 def _train_usage() -> str:
     return f"""\
-usage: credo train ALGORITHM TASK [--network NAME] [--preset NAME] [--delayed] [--from RUN] [flags]
+usage: credo train ALGORITHM TASK [--network NAME] [--preset NAME] [--delayed] [--from RUN]
+                                  [--kwargs NAME=VALUE …] [--rewards NAME=MODULE:FUNCTION …] [flags]
 
 algorithms: {", ".join(ALGORITHMS)}
 tasks:      {", ".join(TASKS)}
             or one of Gymnasium, such as Hopper-v5
             or a team of PettingZoo, such as mpe2.simple_spread_v3
-            or package.module:Class
+            or package.module:name of a class of your own, or of a function that makes a task
 networks:   {", ".join(NETWORKS)} (default: the algorithm's own)
             each agent of a team has a network of its own, unless it is one for teams
 presets:    as-written (the default), as-coded, ours, of neuroevolution and bptt; dmmu, of
@@ -393,7 +421,13 @@ def _start(algorithm: Any, label: str, *, seed: int, seeds: int, path: str | Non
 
 @dataclasses.dataclass
 class ResumeOptions:
-    """Go on with a run."""
+    """Go on with a run, or with every unfinished run of a folder that `--seeds` made.
+
+    Beside the flags below: --set FIELD=VALUE (go on with another setting, such as
+    learner.actor_lr=1e-4; may be given several times), --trust (the run was made elsewhere and
+    names code of somebody's own: import it), --without-replay (start with an empty replay buffer,
+    where the one that was saved is damaged).
+    """
 
     generations: int | None = None  # a larger budget; with none given, the run's own
     frames: int | None = None  # a larger budget in environment steps, such as 2e6
@@ -404,56 +438,84 @@ class ResumeOptions:
 
 
 def _resume(argv: list[str]) -> None:
-    path, argv = _positional(argv, "resume RUN", "the run's folder")
-    (options,) = parse("credo resume RUN", None, ResumeOptions, argv)
+    path, argv = _positional(argv, "resume RUN", "the run's folder, or one with runs in it")
+    changes, argv = pop_changes(argv, "--set")
+    trust, argv = pop_switch(argv, "--trust")
+    without_replay, argv = pop_switch(argv, "--without-replay")
+    popped = ("--set", "--trust", "--without-replay")
+    (options,) = parse("credo resume RUN", None, ResumeOptions, argv, popped=popped)
+    in_range(options)
+    fields = vars(options) | {"wall_clock": seconds(options.wall_clock)}
+    fields |= {"set": changes, "trust": trust, "without_replay": without_replay}
+    runs = _runs(path)
+    if len(runs) == 1:
+        print(_summary(_going_on(runs[0], **fields)))
+        return
+    _resume_all(pathlib.Path(path), runs, **fields)
 
+
+def _going_on(path: pathlib.Path, **fields: Any) -> Any:
     from .runs import loop
 
-    def go() -> None:
-        run = loop.resume(
-            path,
-            generations=options.generations,
-            frames=options.frames,
-            stop_at=options.stop_at,
-            wall_clock=seconds(options.wall_clock),
-            checkpoint_every=options.checkpoint_every,
-            keep=options.keep,
-        )
-        print(_summary(run))
-
-    _guarded(go)
+    with _began(loop.Run(path, trust=fields["trust"])):
+        return loop.resume(path, **fields)
 
 
 @dataclasses.dataclass
 class EvaluateOptions:
-    """Fresh episodes for a champion. Flags of the task, such as --depth 101, change the task."""
+    """Fresh episodes for a champion, or for that of every run of a folder that `--seeds` made.
+
+    Flags of the task, such as --depth 101, change the task; --kwargs NAME=VALUE … those of
+    Gymnasium and PettingZoo. --trust: the run was made elsewhere and names code of somebody's own:
+    import it.
+    """
 
     episodes: int | None = None  # episodes, all fresh; None: 1000, outside JAX 20
     seed: int = 0  # of the episodes
 
 
+def _evaluated(run: Any, argv: list[str]) -> list[Any]:
+    """The task of a run with what the flags change, and the options."""
+    settings, argv = _settings(argv)
+    env = run.algorithm.env
+    task, options = parse(
+        "credo evaluate RUN",
+        _with_settings(env, settings),
+        EvaluateOptions,
+        argv,
+        flat=True,
+        popped=("--trust", *OF_TASKS),
+    )
+    in_range(options)
+    if task != env and (changed := _changed(_sizes(env), task, "where it was trained")):
+        fail(f"with these flags {changed}: its champion cannot act there")
+    return [task, options]
+
+
 def _evaluate(argv: list[str]) -> None:
-    path, argv = _positional(argv, "evaluate RUN", "the run's folder")
+    path, argv = _positional(argv, "evaluate RUN", "the run's folder, or one with runs in it")
+    trust, argv = pop_switch(argv, "--trust")
+    from .runs import evaluation, loop
 
-    def go() -> None:
-        from .runs import loop
-
-        run = loop.Run(path)
-        task, options = parse(
-            "credo evaluate RUN", run.algorithm.env, EvaluateOptions, argv, flat=True
-        )
-        from .runs import evaluation
-
-        for line in evaluation.describe(run, task, options.episodes, options.seed):
-            print(line)
-
-    _guarded(go)
+    results = []
+    for each in _runs(path):
+        run = loop.Run(each, trust=trust)
+        with _began(run):
+            task, options = _evaluated(run, argv)
+            lines, result = evaluation.describe(run, task, options.episodes, options.seed)
+        print("\n".join(lines))
+        results += [] if result is None else [result]
+    if len(results) > 1:
+        print("\n".join(evaluation.summary(pathlib.Path(path), results)))
 
 
 @dataclasses.dataclass
 class WatchOptions:
     """Show a champion: rovers in a page that plays, a T-maze in a page of pictures, tasks of
-    Gymnasium in a film."""
+    Gymnasium in a film.
+
+    --trust: the run was made elsewhere and names code of somebody's own: import it.
+    """
 
     episodes: int = 1  # one after the other
     seed: int = 0  # of the first episode; the next ones count up
@@ -464,30 +526,31 @@ class WatchOptions:
 def _watch(argv: list[str]) -> None:
     path, argv = _positional(argv, "watch RUN [FILE]", "the run's folder; .html, .gif or .mp4")
     film, argv = (argv[0], argv[1:]) if argv and not argv[0].startswith("-") else ("", argv)
-    (options,) = parse("credo watch RUN [FILE]", None, WatchOptions, argv)
+    trust, argv = pop_switch(argv, "--trust")
+    (options,) = parse("credo watch RUN [FILE]", None, WatchOptions, argv, popped=("--trust",))
+    in_range(options, options.episodes)
+    from .runs import loop, watch
 
-    def go() -> None:
-        from .runs import loop, watch
-
+    run = loop.Run(_one_run("watch", path), trust=trust)
+    with _began(run):
         target = pathlib.Path(film) if film else None
-        print(f"wrote {watch.watch(loop.Run(path), target, **vars(options))}")
-
-    _guarded(go)
+        print(f"wrote {watch.watch(run, target, **vars(options))}")
 
 
 def _export(argv: list[str]) -> None:
     path, argv = _positional(argv, "export RUN [FILE]", "the run's folder; policy.safetensors")
-    if len(argv) > 1 or argv[:1] in (["-h"], ["--help"]):
-        print("usage: credo export RUN [FILE]\n\n  the champion for credo.runner, without JAX")
-        raise SystemExit(0 if len(argv) == 1 else 2)
+    trust, argv = pop_switch(argv, "--trust")
+    if len(argv) > 1 or (argv and argv[0].startswith("-")):
+        print("usage: credo export RUN [FILE] [--trust]\n")
+        print("  the champion for credo.runner, without JAX; --trust: the run was made elsewhere")
+        print("  and names code of somebody's own: import it")
+        raise SystemExit(0 if argv in (["-h"], ["--help"]) else 2)
+    from .runs import export, loop
 
-    def go() -> None:
-        from .runs import export, loop
-
-        target = argv[0] if argv else pathlib.Path(path) / "policy.safetensors"
-        print(f"policy: {export.export(loop.Run(path), pathlib.Path(target))}")
-
-    _guarded(go)
+    run = loop.Run(_one_run("export", path), trust=trust)
+    with _began(run):
+        target = argv[0] if argv else run.path / "policy.safetensors"
+        print(f"policy: {export.export(run, pathlib.Path(target))}")
 
 
 @dataclasses.dataclass
@@ -509,52 +572,63 @@ def _reproduce(argv: list[str]) -> None:
     if name not in EXPERIMENTS:
         fail(f"no experiment {name!r}", name, EXPERIMENTS)
     (options,) = parse(f"credo reproduce {name}", None, ReproduceOptions, argv)
+    in_range(options)
     budgets = ("smoke", "quick", "full", "million", "published")
     if options.budget not in budgets:
         fail(f"no budget {options.budget!r}", options.budget, budgets)
+    from .experiments import base
 
-    def go() -> None:
-        from .experiments import base
-
-        page = base.reproduce(
-            name,
-            options.budget,
-            runs=options.runs,
-            only=options.only,
-            jobs=options.jobs,
-            output=pathlib.Path(options.output),
-            work=pathlib.Path(options.work),
-        )
-        print(f"page: {page}")
-
-    _guarded(go)
+    page = base.reproduce(
+        name,
+        options.budget,
+        runs=options.runs,
+        only=options.only,
+        jobs=options.jobs,
+        output=pathlib.Path(options.output),
+        work=pathlib.Path(options.work),
+    )
+    print(f"page: {page}")
 
 
 def _report(argv: list[str]) -> None:
     output, argv = pop_option(argv, "--output", "", "-o")
-    if not argv or {"-h", "--help"} & set(argv):
+    asked = bool({"-h", "--help"} & set(argv))
+    if not argv or any(token.startswith("-") for token in argv):
         print("usage: credo report RUN [RUN …] [-o report.html]\n\n  one page about finished or")
-        print("  running runs; runs that differ only in their seed are one curve")
-        raise SystemExit(0 if argv else 2)
+        print(
+            "  running runs, or folders of runs; runs that differ only in their seed are one curve"
+        )
+        raise SystemExit(0 if asked else 2)
+    from .runs import report
 
-    def go() -> None:
-        from .runs import report
+    named = [pathlib.Path(token) for token in argv]
+    paths = [run for path in named for run in _runs(path)]
+    folder = named[0] if len(named) == 1 else _common(named)
+    target = pathlib.Path(output) if output else folder / "report.html"
+    print(f"page: {report.write(paths, target)}")
 
-        paths = [pathlib.Path(token) for token in argv]
-        target = pathlib.Path(output) if output else paths[0] / "report.html"
-        print(f"page: {report.write(paths, target)}")
 
-    _guarded(go)
+def _common(paths: list[pathlib.Path]) -> pathlib.Path:
+    """The folder in which all of these lie: a page about several runs belongs to none of them."""
+    return pathlib.Path(os.path.relpath(os.path.commonpath([p.absolute().parent for p in paths])))
 
 
 @dataclasses.dataclass
 class CheckOptions:
-    """Look for mistakes in a task. Flags of the task, such as --max-episode-steps, change it."""
+    """Look for mistakes in a task. Flags of the task, such as --max-episode-steps, change it;
+    --kwargs NAME=VALUE … is what a task of Gymnasium or PettingZoo is made with."""
 
 
 def _check(argv: list[str]) -> None:
-    name, argv = _positional(argv, "check TASK", "a task's name or package.module:Class")
-    env, _ = parse("credo check TASK", _task(name), CheckOptions, argv, flat=True)
+    name, argv = _positional(argv, "check TASK", "a task's name or package.module:name")
+    settings, argv = _settings(argv)
+    env, _ = parse(
+        "credo check TASK", _task(name, settings), CheckOptions, argv, flat=True, popped=OF_TASKS
+    )
+    from .environments.host import AbstractHostEnvironment
+
+    if isinstance(env, AbstractHostEnvironment):
+        say(f"{name}: two copies play two episodes each; of long ones the first minute")
     problems = _problems(env)
     for problem in problems:
         print(f"- {problem}")
@@ -570,55 +644,101 @@ def _load(path: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-def _task(name: str) -> Any:
-    """A task with its defaults: by our name for it, as `package.module:Class`, or by
+def _settings(argv: list[str]) -> tuple[dict[str, dict[str, Any]], list[str]]:
+    """Take `--kwargs` and `--rewards` out of the arguments: fields of a task of others."""
+    settings = {}
+    for flag in OF_TASKS:
+        pairs, argv = pop_pairs(argv, flag)
+        if pairs:
+            settings[flag.removeprefix("--")] = pairs
+    return settings, argv
+
+
+def _with_settings(env: Any, settings: dict[str, dict[str, Any]]) -> Any:
+    """A task with other `kwargs` and `rewards`; what is not named stays."""
+    known = {f.name for f in dataclasses.fields(env)}
+    if not settings:
+        return env
+    if "env" in known and not settings.keys() & known:  # a wrapper
+        return dataclasses.replace(env, env=_with_settings(env.env, settings))
+    for name in settings.keys() - known:
+        fail(f"{type(env).__name__} has no --{name}: its settings are flags, see --help")
+    old = {name: dict(getattr(env, name) or ()) for name in settings}
+    try:
+        return dataclasses.replace(env, **{name: old[name] | settings[name] for name in old})
+    except ValueError as error:
+        fail(str(error))
+
+
+def _task(name: str, settings: dict[str, dict[str, Any]]) -> Any:
+    """A task with its defaults: by our name for it, as `package.module:name`, or by
     Gymnasium's."""
     if name in TASKS:
-        return _load(TASKS[name][0])()
+        return _with_settings(_load(TASKS[name][0])(), settings)
     if re.fullmatch(r"\w+(\.\w+)*:\w+", name):
-        return _own_task(name)
+        return _own_task(name, settings)
     if re.fullmatch(r"\w+(\.\w+)+", name):  # a module with parallel_env
-        return _load(PETTINGZOO)(id=name)
+        return _with_settings(_load(PETTINGZOO)(id=name), settings)
     import gymnasium
 
     module, _, registered = name.rpartition(":")
     if module:  # package:Name-v0, registered when it is imported
-        try:
-            importlib.import_module(module)
-        except ImportError as error:
-            fail(f"cannot import {module!r} of {name!r}: {error}")
+        _of_user(name, lambda: importlib.import_module(module))
     if registered not in gymnasium.registry:
         fail(
-            f"no task {name!r}; one of your own is written package.module:Class",
+            f"no task {name!r}; one of your own is written package.module:name",
             name,
             TASKS,
             gymnasium.registry,
         )
-    return _load(GYMNASIUM)(id=name)
+    return _with_settings(_load(GYMNASIUM)(id=name), settings)
 
 
-def _own_task(name: str) -> Any:
-    try:
-        cls = _load(name)
-    except (ImportError, AttributeError) as error:
-        fail(f"cannot import {name!r}: {error}. Start credo in the folder of its file")
-    import gymnasium
-
+def _own_task(name: str, settings: dict[str, dict[str, Any]]) -> Any:
+    """A class of one's own, or a plain function that makes an environment: it may be called, since
+    it is named on this command line."""
+    from .environments import names
     from .environments.base import AbstractEnvironment
     from .environments.host import AbstractHostEnvironment
 
-    if isinstance(cls, type) and issubclass(cls, gymnasium.Env):
-        return _load(GYMNASIUM)(id=name)
-    if any(
-        f"{base.__module__}.{base.__name__}" == PARALLEL for base in getattr(cls, "__mro__", ())
-    ):
-        return _load(PETTINGZOO)(id=name)
-    ours = (AbstractEnvironment, AbstractHostEnvironment)
-    if not (isinstance(cls, type) and issubclass(cls, ours)):
-        fail(f"{name} is no task: derive it from credo.AbstractEnvironment or gymnasium.Env")
+    found = _of_user(name, lambda: names.find(name))
+    if found is None:
+        module, _, missing = name.partition(":")
+        fail(
+            f"cannot import {name!r}: {module} has no {missing}. Start credo in the folder of its "
+            "file"
+        )
+    if isinstance(found, type) and issubclass(found, AbstractEnvironment | AbstractHostEnvironment):
+        return _with_settings(_of_user(name, found), settings)
+    kind = _of_user(name, lambda: names.kind_of(name, settings.get("kwargs", {})))
+    if kind is None:
+        fail(
+            f"{name} is no task: derive it from credo.AbstractEnvironment or gymnasium.Env, or "
+            "name a function that makes a gymnasium.Env or a pettingzoo.ParallelEnv"
+        )
+    return _with_settings(
+        _load({"gymnasium": GYMNASIUM, "pettingzoo": PETTINGZOO}[kind])(id=name), settings
+    )
+
+
+def _of_user(name: str, call: Any) -> Any:
+    """Call what imports or makes somebody's task. What it raises ends with where that was."""
+    module = repr(name.rpartition(":")[0])
     try:
-        return cls()
-    except TypeError as error:
+        return call()
+    except SyntaxError as error:
+        fail(f"cannot import {module} of {name}: {error.filename}:{error.lineno}: {error.msg}")
+    except ImportError as error:
+        fail(f"cannot import {name!r}: {error}. Start credo in the folder of its file")
+    except SystemExit as error:
+        fail(
+            f"cannot import {module} of {name}: {ending.place(error)} ends Python (exit code "
+            f"{error.code!r}): put that under if __name__ == '__main__'"
+        )
+    except Exception as error:
+        place, what = ending.place(error), f"{type(error).__name__}: {ending.first(error)}"
+        if place or not isinstance(error, TypeError):
+            fail(f"cannot use {name}: {place or 'it'} raised {what}")
         fail(
             f"{name} cannot be made without arguments ({error}): give every field a default, and "
             "define obs_size and max_steps"
@@ -632,7 +752,7 @@ def _require_sound(name: str, env: Any) -> None:
     if ":" in name:
         problems = _problems(env)
         if problems:
-            print("\n".join(f"- {problem}" for problem in problems), file=sys.stderr)
+            say("\n".join(f"- {problem}" for problem in problems))
             fail(f"{name} cannot be trained on before this is mended")
     elif name not in TASKS:
         try:
@@ -668,6 +788,92 @@ def _positional(argv: list[str], usage: str, what: str) -> tuple[str, list[str]]
     raise SystemExit(0 if argv else 2)
 
 
+def _runs(path: str | pathlib.Path) -> list[pathlib.Path]:
+    """The run that is this folder, or those that lie in it, as `--seeds` leaves them."""
+    from .runs import loop
+
+    return loop.runs_in(pathlib.Path(path))
+
+
+def _one_run(command: str, path: str) -> pathlib.Path:
+    runs = _runs(path)
+    if len(runs) > 1:
+        first = f"credo {command} {runs[0]}"
+        fail(
+            f"{path} holds {len(runs)} runs: name one of them, as in {first}", known=map(str, runs)
+        )
+    return runs[0]
+
+
+def _resume_all(base: pathlib.Path, runs: list[pathlib.Path], **fields: Any) -> None:
+    """Go on with every run that is not finished, in processes of their own; with options that
+    other processes are not told, one after the other."""
+    from .runs import executor, loop
+
+    if fields["set"] or fields["trust"] or fields["without_replay"]:
+        for path in runs:
+            print(_summary(_going_on(path, **fields)))
+        return
+    told = {name: fields[name] for name in ("wall_clock", "checkpoint_every", "keep")}
+    jobs = []
+    for path in runs:
+        record = loop.Run(path).config
+        budget = {name: fields[name] for name in ("generations", "frames", "stop_at")}
+        if budget["generations"] is budget["frames"] is None:
+            stop_at = budget["stop_at"]
+            budget = record["budget"] | ({} if stop_at is None else {"stop_at": stop_at})
+        again = {"seed": record["seed"], "warm_start": record.get("warm_start")}
+        jobs.append(executor.Job(path, record["algorithm"], **budget, **again, **told))
+    executor.run(jobs, title=base.name)
+    for path in runs:
+        print(_summary(loop.Run(path)))
+
+
+@contextlib.contextmanager
+def _began(run: Any) -> Iterator[None]:
+    """An error that comes from a task which is not what it was, or not where it was, when this run
+    began says so."""
+    from .environments.host import EnvironmentFailure
+    from .runs.checkpoint import CheckpointError
+    from .runs.config import ConfigError
+    from .runs.loop import RunError
+
+    task = run.config.get("task", {})  # runs of older versions have none
+    try:
+        yield
+    except CheckpointError as error:
+        now = _changed(task, run.algorithm.env, "when this run began") if task else ""
+        if not now or "does not fit" not in str(error):
+            raise
+        raise RunError(f"{now}: go on with the task as it was, or begin a new run") from error
+    except (ConfigError, EnvironmentFailure) as error:
+        folder = task.get("folder")
+        if folder in (None, _here()) or "No module named" not in str(error):
+            raise
+        raise RunError(f"{error}. This run began in {folder}: start credo there") from error
+
+
+def _sizes(env: Any) -> dict[str, Any]:
+    return {name: getattr(env, name) for name in ("obs_size", "action_size", "agents")}
+
+
+def _changed(before: dict[str, Any], env: Any, when: str) -> str:
+    """What of a task is not what it was, in words, or ""."""
+    words = {
+        "obs_size": "numbers in an observation",
+        "action_size": "numbers in an action",
+        "agents": "agents",
+    }
+    now = _sizes(env)
+    told = [
+        f"{now[name] or 1} {what} today and {before[name] or 1} {when}"
+        for name, what in words.items()
+        if name in before and now[name] != before[name]
+    ]
+    task = getattr(env, "id", type(env).__name__)
+    return f"{task} has {', and '.join(told)}" if told else ""
+
+
 def _summary(run: Any) -> str:
     from .runs.progress import best_of
 
@@ -691,30 +897,10 @@ def _note_start(algorithm: Any, frames: int | None) -> None:
         return
     start = getattr(algorithm, flag)
     if frames <= start:
-        print(
+        say(
             f"credo: note: nothing is learned by gradient in the first {start:,} frames, and this "
-            f"run ends after {frames:,}: give more --frames, or fewer --{flag.replace('_', '-')}",
-            file=sys.stderr,
+            f"run ends after {frames:,}: give more --frames, or fewer --{flag.replace('_', '-')}"
         )
-
-
-def _guarded(go: Any) -> None:
-    """Errors that a user can mend end in one line; an interrupt with the code a shell expects."""
-    from .environments.host import EnvironmentFailure
-    from .runs.checkpoint import CheckpointError
-    from .runs.config import ConfigError
-    from .runs.lock import RunLocked
-    from .runs.loop import Interrupted, RunError
-
-    expected = (RunError, ConfigError, CheckpointError, RunLocked, EnvironmentFailure)
-    try:
-        go()
-    except Interrupted as stop:
-        print(f"credo: {stop}", file=sys.stderr)
-        raise SystemExit(stop.code) from None
-    except (*expected, ValueError, OSError) as error:
-        print(f"credo: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
 
 
 if __name__ == "__main__":

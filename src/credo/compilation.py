@@ -3,6 +3,7 @@
 import functools
 import os
 import pathlib
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -11,10 +12,18 @@ import jax
 import jax.core
 import numpy as np
 
-cache_directory = pathlib.Path(
-    os.environ.get("CREDO_CACHE")
-    or pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "credo"
-)
+
+def cache_directory() -> pathlib.Path | None:
+    """Where compiled programs are kept: `$CREDO_CACHE`, or `credo` in `$XDG_CACHE_HOME` or
+    `~/.cache`. None if nothing can be written there, or nobody knows where home is."""
+    try:
+        named = os.environ.get("CREDO_CACHE")
+        home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+        path = pathlib.Path(named) if named else pathlib.Path(home) / "credo"
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # without HOME, and with a user whom the system does not know
+        return None
+    return path if os.access(path, os.W_OK | os.X_OK) else None
 
 
 def jit(function: Any = None, *, donate: Any = "none") -> Any:
@@ -52,10 +61,20 @@ def when(due: Any, play: Callable[[], Any], skip: Callable[[], Any]) -> Any:
     return play() if due else skip()
 
 
+@functools.cache  # said once
 def enable_cache() -> None:
-    """Keep compiled programs in `~/.cache/credo` (or `$CREDO_CACHE`) between processes."""
+    """Keep compiled programs in `cache_directory()` between processes."""
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
         return  # the user's own choice, with thresholds of their own
-    jax.config.update("jax_compilation_cache_dir", str(cache_directory / "xla"))
+    directory = cache_directory()
+    if directory is None:
+        # Not in a folder for temporary files: whoever can write there could give us programs.
+        warnings.warn(
+            "compiled programs are not kept, so every command compiles anew: HOME has no .cache "
+            "that can be written; set CREDO_CACHE to a folder that can",
+            stacklevel=2,
+        )
+        return
+    jax.config.update("jax_compilation_cache_dir", str(directory / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)

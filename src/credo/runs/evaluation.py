@@ -1,7 +1,8 @@
 """What `credo evaluate` prints: a champion on fresh episodes."""
 
+import pathlib
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,37 +32,113 @@ def in_turn(task: Any, policies: Any, episodes: int, *, key: PRNGKeyArray) -> Ev
     return jax.tree.map(lambda *xs: jnp.concatenate(xs, axis=1)[:, :episodes], *turns)
 
 
-def describe(run: Run, task: Any, episodes: int | None, seed: int) -> Iterator[str]:
-    """Lines about the champion on `task`, which may differ from the one it was trained on.
-    `episodes`: None for `EPISODES`, or `HOST_EPISODES` of a task outside JAX."""
+class Score(NamedTuple):
+    """What one reward signal came to."""
+
+    mean: float
+    error: float  # standard error of the mean over episodes; NaN of a single one
+    agents: tuple[float, ...] = ()  # of a private signal, each agent's mean
+
+
+class Result(NamedTuple):
+    """A champion on fresh episodes."""
+
+    episodes: int  # that came to their end
+    failed: int  # that did not: their returns are NaN, and they are left out
+    scores: dict[str, Score]
+    steps: float  # in an episode, on average
+
+
+def played(run: Run, task: Any, episodes: int | None, seed: int) -> Result:
+    """Fresh episodes of a run's champion on `task`, which may differ from the one it was trained
+    on. `episodes`: None for `EPISODES`, or `HOST_EPISODES` of a task outside JAX."""
     if episodes is None:
         host = issubclass(type(task), AbstractHostEnvironment)
         episodes = HOST_EPISODES if host else EPISODES
-    policies = tree.stack(run.champion)
-    key = jax.random.fold_in(jax.random.key(seed), 1_000_003)  # not a key of any training run
-    streamed = isinstance(task, SequenceClassification) and task.persistence == 0.5
-    if streamed and task.depth > STREAMED:
-        streams = min(episodes, 20)
-        lengths = counting.longest_correct(
-            policies,
-            task.depth,
-            streams,
-            min_gap=task.min_gap,
-            max_gap=task.max_gap,
-            ties=task.ties,
-            key=key,
-        )[0]
-        yield f"{run.path}: {streams} streams of {task.depth:,} signals"
-        yield f"  success          {np.mean(np.asarray(lengths) >= task.depth):.3f}"
-        yield f"  signals right    median {int(np.median(lengths)):,}, worst {int(lengths.min()):,}"
-        return
-    evaluation = in_turn(task, policies, episodes, key=key)
-    yield f"{run.path}: {episodes} fresh episodes"
-    for name in task.signals:
-        values = np.asarray(evaluation.returns[name][0], np.float64)
-        error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
-        yield f"  {name:<16} {values.mean():.4g} ± {error:.2g}"
-    yield f"  steps            {np.mean(evaluation.steps):.1f}"
+    evaluation = in_turn(task, tree.stack(run.champion), episodes, key=_key(seed))
+    returns = {name: np.asarray(evaluation.returns[name][0], np.float64) for name in task.signals}
+    whole = ~np.any([np.isnan(x.reshape(episodes, -1)).any(1) for x in returns.values()], axis=0)
+    scores = {name: _score(values[whole]) for name, values in returns.items()}
+    steps = np.asarray(evaluation.steps[0], np.float64)[whole]
+    n = int(whole.sum())
+    return Result(n, episodes - n, scores, float(steps.mean()) if n else float("nan"))
+
+
+def describe(
+    run: Run, task: Any, episodes: int | None, seed: int
+) -> tuple[list[str], Result | None]:
+    """What `played` finds, in lines for people. Sequences so deep that they are streamed have no
+    result beside them."""
+    if _streamed(task):
+        return list(_stream(run, task, episodes, seed)), None
+    result = played(run, task, episodes, seed)
+    return list(_lines(run, task, result)), result
+
+
+def _score(values: np.ndarray) -> Score:
+    """Of one signal's returns `[episodes]`, or `[episodes, agents]` of a private one. The agents of
+    one episode are no independent draws: their mean is one value."""
+    agents = tuple(values.mean(axis=0).tolist()) if values.ndim == 2 and len(values) else ()
+    team = values.mean(axis=1) if values.ndim == 2 else values
+    n, nan = len(team), float("nan")
+    error = float(team.std(ddof=1) / np.sqrt(n)) if n > 1 else nan
+    return Score(float(team.mean()) if n else nan, error, agents)
+
+
+def _lines(run: Run, task: Any, result: Result) -> Iterator[str]:
+    """What `played` found, for people."""
+    yield f"{run.path}: {result.episodes} fresh episodes, mean ± standard error over episodes"
+    if result.failed:
+        all_of = result.episodes + result.failed
+        yield f"  {result.failed} of {all_of} episodes failed and are left out"
+    for name, score in result.scores.items():
+        yield _line(name, score) + (
+            f" (mean of {len(score.agents)} agents)" if score.agents else ""
+        )
+        for k, mean in enumerate(score.agents):
+            yield f"    agent {k:<8} {mean:.4g}"
+    yield f"  steps            {result.steps:.1f}"
     if floors.known(task):
         name, value = floors.floor(task)
         yield f"  floor            {value:.3g} ({name}), ceiling {floors.CEILING:.3g}"
+
+
+def summary(path: pathlib.Path, results: list[Result]) -> Iterator[str]:
+    """Several runs together: a run's mean is one value."""
+    yield f"{path}: {len(results)} runs, mean ± standard error over runs"
+    for name in results[0].scores:
+        yield _line(name, _score(np.array([result.scores[name].mean for result in results])))
+
+
+def _line(name: str, score: Score) -> str:
+    error = "" if np.isnan(score.error) else f" ± {score.error:.2g}"
+    return f"  {name:<16} {score.mean:.4g}{error}"
+
+
+def _key(seed: int) -> PRNGKeyArray:
+    return jax.random.fold_in(jax.random.key(seed), 1_000_003)  # not a key of any training run
+
+
+def _streamed(task: Any) -> bool:
+    """Whether episodes are so long that they are streamed."""
+    ours = isinstance(task, SequenceClassification) and task.persistence == 0.5
+    return ours and task.depth > STREAMED
+
+
+def _stream(
+    run: Run, task: SequenceClassification, episodes: int | None, seed: int
+) -> Iterator[str]:
+    """Lines about the champion on sequences of any length, whose memory does not grow with it."""
+    streams = min(episodes or EPISODES, 20)
+    lengths = counting.longest_correct(
+        tree.stack(run.champion),
+        task.depth,
+        streams,
+        min_gap=task.min_gap,
+        max_gap=task.max_gap,
+        ties=task.ties,
+        key=_key(seed),
+    )[0]
+    yield f"{run.path}: {streams} streams of {task.depth:,} signals"
+    yield f"  success          {np.mean(np.asarray(lengths) >= task.depth):.3f}"
+    yield f"  signals right    median {int(np.median(lengths)):,}, worst {int(lengths.min()):,}"

@@ -1,4 +1,8 @@
-"""One page about runs: what `credo report` writes."""
+"""One page about runs: what `credo report` writes.
+
+It reads what runs have recorded: no environment is opened, and no code that a record names is
+imported but Credo's own. So a page about a stranger's run needs no trust in them.
+"""
 
 import json
 import pathlib
@@ -10,9 +14,10 @@ import numpy as np
 
 from ..analysis import attribution, floors, statistics
 from ..environments.base import AbstractSequenceTask
+from ..environments.sequence_classification import SequenceClassification
+from ..environments.sequence_recall import SequenceRecall
 from ..evolution.lineage import MAKERS
 from ..learners.base import AbstractLearner
-from ..learners.td3 import TD3
 from . import config
 from .loop import Run, RunError
 from .page import Curve, Figure, Page, Reference, Section, Table
@@ -101,8 +106,8 @@ def _figure(runs: dict[str, list[Run]], metric: str, title: str) -> Figure:
     unit = "frames" if all(budget.get("frames") for budget in budgets) else "generation"
     for label, group in runs.items():
         curves.append(_curve(label, group, metric, unit))
-        task = group[0].algorithm.env
-        if metric == "champion_score" and isinstance(task, AbstractSequenceTask) and not references:
+        task = _task(group[0])
+        if metric == "champion_score" and task is not None and not references:
             known = floors.floor(task) if floors.known(task) else None
             if known is not None:
                 references.append(Reference(f"floor: {known[0]}", known[1]))
@@ -127,7 +132,7 @@ def _attributions(runs: dict[str, list[Run]]) -> list[Section]:
     for label, group in runs.items():
         metrics = [run.metrics for run in group]
         if all(map(attribution.known, metrics)):
-            names = learner_names(group[0].algorithm.learners)
+            names = learner_names(group[0].config["algorithm"].get("learners", ()))
             title = f"{label}: " if len(runs) > 1 else ""
             sections += attributed(attribution.summary(metrics), names, title)
     return sections
@@ -193,29 +198,38 @@ def percent(shares: np.ndarray) -> str:
     return f"{mean:.1f} ± {error:.1f}" if len(shares) > 1 else f"{mean:.1f}"
 
 
-def learner_names(learners: Sequence[AbstractLearner]) -> list[str]:
-    """What to call them: their kind and discount, and a number where that is not enough."""
-    names = [_learner_name(learner) for learner in learners]
+def learner_names(learners: Sequence[AbstractLearner | dict[str, Any]]) -> list[str]:
+    """What to call learners, or records of them: their kind and discount, and a number where that
+    is not enough."""
+    names = [_learner_name(config.to_tree(learner)) for learner in learners]
     return [
         f"{name} ({names[:i].count(name) + 1})" if names.count(name) > 1 else name
         for i, name in enumerate(names)
     ]
 
 
-def _learner_name(learner: AbstractLearner) -> str:
-    kind = type(learner).__name__
-    if isinstance(learner, TD3) and learner.critics == learner.policy_delay == 1:
+def _learner_name(learner: dict[str, Any]) -> str:
+    kind = learner["class"].partition(":")[2]
+    if kind == "TD3" and learner.get("critics") == learner.get("policy_delay") == 1:
         kind = "DDPG"  # the same mathematics, less three additions
-    gamma = getattr(learner, "gamma", None)
+    gamma = learner.get("gamma")
     return kind if gamma is None else f"{kind} γ {gamma:g}"
+
+
+def _task(run: Run) -> AbstractSequenceTask | None:
+    """The task of a run, if it is one whose floor Credo may know. Any other is not made: that might
+    run somebody's code."""
+    recorded = run.config["algorithm"]["env"]
+    ours = map(config.class_name, (SequenceClassification, SequenceRecall))
+    return config.from_tree(recorded) if recorded["class"] in ours else None
 
 
 def _table(runs: dict[str, list[Run]]) -> Table:
     rows = []
     for label, group in runs.items():
         scores = np.array([run.metrics["champion_score"][-1] for run in group])
-        task = group[0].algorithm.env
-        known = floors.floor(task) if floors.known(task) else None
+        task = _task(group[0])
+        known = None if task is None or not floors.known(task) else floors.floor(task)
         mean, error = statistics.mean_and_standard_error(scores)
         spread = (
             f"{float(mean):.3f} ± {float(error):.3f}" if len(scores) > 1 else f"{scores[0]:.3f}"
