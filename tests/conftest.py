@@ -1,9 +1,14 @@
 import os
+import tempfile
 
 # Tests run one worker per core: one thread each, and programs compiled for speed of compiling.
 os.environ.setdefault(
     "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0"
 )
+
+# Runs are signed with a key in the user's own folder: here one for all tests of a process.
+settings = tempfile.TemporaryDirectory(prefix="credo-tests-")
+os.environ["XDG_CONFIG_HOME"] = settings.name
 
 import jax
 import pytest
