@@ -6,10 +6,6 @@ os.environ.setdefault(
     "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0"
 )
 
-# Runs are signed with a key in the user's own folder: here one for all tests of a process.
-settings = tempfile.TemporaryDirectory(prefix="credo-tests-")
-os.environ["XDG_CONFIG_HOME"] = settings.name
-
 import jax
 import pytest
 
@@ -19,6 +15,10 @@ compilation.enable_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Runs are signed with a key in the user's own folder: here one for all tests of a process.
+settings = tempfile.TemporaryDirectory(prefix="credo-tests-")
+os.environ["XDG_CONFIG_HOME"] = settings.name
 
 
 @pytest.fixture(autouse=True, scope="module")
