@@ -563,11 +563,14 @@ def _warm(algorithm: Any, state: PyTree, source: Run) -> PyTree:
     except checkpoint.CheckpointError as error:
         if "does not fit" not in str(error):
             raise  # it is missing or damaged
-        theirs, ours = source.algorithm.network, algorithm.network
+        theirs = [
+            source.part(name) or config.brief(source.config["algorithm"][name])
+            for name in ("network", "env")
+        ]
         raise RunError(
-            f"the champion of {source.path} is {theirs} on {source.algorithm.env}, and this run is "
-            f"{ours} on {algorithm.env}: give the same --preset or --network, and a task of the "
-            f"same sizes ({str(error).splitlines()[0]})"
+            f"the champion of {source.path} is {theirs[0]} on {theirs[1]}, and this run is "
+            f"{algorithm.network} on {algorithm.env}: give the same --preset or --network, and a "
+            f"task of the same sizes ({str(error).splitlines()[0]})"
         ) from error
     return algorithm.warm(state, policy)
 
