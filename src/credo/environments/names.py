@@ -6,6 +6,8 @@ such as os:system or subprocess:Popen is refused unused. Importing a module exec
 same: `foreign_code` says whose code a name would import. No JAX here: a worker imports this.
 """
 
+import contextlib
+import dataclasses
 import importlib
 import importlib.util
 import inspect
@@ -161,8 +163,8 @@ def kind_of(name: str, kwargs: Mapping[str, Any] | None = None) -> str | None:
         if not isinstance(made, type) or made is inspect.Signature.empty:
             env = maker(**(kwargs or {}))
             made = type(env)
-            if callable(close := getattr(env, "close", None)):
-                close()
+            with contextlib.suppress(Exception):  # nobody needs it any more
+                env.close()
     bases = getattr(made, "__mro__", ())
     if gymnasium.Env in bases:
         return "gymnasium"
