@@ -517,7 +517,7 @@ def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
 
     def write(obs: Any, row: np.ndarray) -> None:
         if not isinstance(obs, kind) or len(obs) != len(writes):
-            told = f"the keys {list(obs)}" if isinstance(obs, Mapping) else type(obs).__name__
+            told = f"the keys {list(obs)}" if isinstance(obs, Mapping) else _kind(obs)
             raise Fault(
                 f"returned {said} of {told}",
                 f"its observation_space says {list(parts)}: make the two agree",
@@ -535,6 +535,11 @@ def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
         np.concatenate([np.zeros(0), *(flat[k] for flat in flats.values())]) for k in (2, 3)
     )
     return _Flat(at, "uint8" if small and flats else "float32", low, high, write)
+
+
+def _kind(x: Any) -> str:
+    length = f" and length {len(x)}" if isinstance(x, (tuple, list)) else ""
+    return f"type {type(x).__name__}{length}"
 
 
 def _padded(flat: _Flat, size: int) -> list[Any]:

@@ -423,8 +423,8 @@ class _Look:
             self._range(f"step {t}", step.obs[i])
 
     def _failures(self, failed: np.ndarray | None) -> None:
-        """None is tolerated here."""
-        for i in np.flatnonzero(failed) if failed is not None else ():
+        """None is tolerated here; copies that fail together do so for one reason."""
+        for i in np.flatnonzero(failed)[:1] if failed is not None else ():
             self.problems.append(self.copies.failure_text(int(i)))
 
     def _range(self, when: str, obs: np.ndarray) -> None:

@@ -214,9 +214,7 @@ def registered(id: str) -> dict[str, Any] | None:
         "kwargs": spec.kwargs,
         "max_episode_steps": spec.max_episode_steps,
         "order_enforce": spec.order_enforce,
-        "additional_wrappers": [
-            [w.name, w.entry_point, w.kwargs] for w in spec.additional_wrappers
-        ],
+        "additional_wrappers": [dataclasses.astuple(x) for x in spec.additional_wrappers],
     }
     if entry is None or here_alone(entry) or not _json(told):
         return {"id": spec.id, "entry_point": None}
