@@ -69,6 +69,7 @@ class Single:
         self.action_size, self.read = _actions(env.action_space)
         self.actions = _described(env.action_space)
         self.discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
+        self.said: dict[int, Any] = {}  # by copy: its last observation, as it came
         self._masks: dict[int, np.ndarray] = {}  # by copy: which actions it allows next
         if self.discrete:
             self._choose, self.read = self.read, self._allowed
@@ -90,6 +91,7 @@ class Single:
         """A fresh episode of copy `i`, written to its row of the frame."""
         result = env.reset(seed=seed)
         _count(result, 2, "reset", "(observation, info)")
+        self.said[i] = result[0]
         self._write(result[0], frame.obs[i])
         if self.discrete:
             self._allow(*result, i)
@@ -99,6 +101,7 @@ class Single:
         result = env.step(action)
         _count(result, 5, "step", "(observation, reward, terminated, truncated, info)")
         obs, reward, terminated, truncated, info = result
+        self.said[i] = obs
         self._write(obs, frame.obs[i])
         frame.rewards["reward"][i] = reward if isinstance(reward, (float, int)) else _number(reward)
         terminated, truncated = _flag("terminated", terminated), _flag("truncated", truncated)
@@ -178,6 +181,7 @@ class Team:
         self.obs_dtype = "uint8" if all(x.dtype == "uint8" for x in flats) else "float32"
         self.obs_range = [_padded(flat, self.obs_size) for flat in flats]
         self.action_size = max(size for size, _ in actions)
+        self.said: dict[int, Any] = {}  # by copy: its last observations, as they came
         self._writes = [(flat.size, flat.write) for flat in flats]
         self._actions = actions
         self._owing: dict[int, set[str]] = {}  # by copy: who was there and has not terminated
@@ -213,6 +217,7 @@ class Team:
         result = env.reset(seed=seed)
         _count(result, 2, "reset", "(observations, infos)")
         here = self._here(env)
+        self.said[i] = result[0]
         self._write(result[0], here, frame, i)
         self._owing[i] = set(here)
 
@@ -234,6 +239,7 @@ class Team:
         here = [name for name in self._here(env) if name not in left]
         owing.update(here)
         # Who leaves may say a last word: the observation that a learner bootstraps from.
+        self.said[i] = obs
         self._write(obs, [*here, *(name for name in left if name in obs)], frame, i)
         frame.active[i, [self._rows[name] for name in here]] = True
         frame.terminated[i] = not here and not owing

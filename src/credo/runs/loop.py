@@ -32,6 +32,7 @@ from jaxtyping import PRNGKeyArray, PyTree
 
 from .. import compilation, require
 from ..compilation import jit
+from ..environments import processes
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..replay import shapes_alone
 from . import checkpoint, config, log
@@ -152,6 +153,7 @@ def train(
     **Raises:** `RunError` if the folder holds a run already, if the algorithm cannot start from
     a policy, or if an environment outside JAX fails; `Interrupted` after a signal.
     """
+    processes.allow()
     compilation.enable_cache()
     budget = Budget.of(algorithm, generations, frames, stop_at)
     require.at_least("keep", keep, 1)
@@ -214,6 +216,7 @@ def resume(
     A new budget takes the place of the whole old one: with `generations` alone a limit of frames
     is dropped, and the other way round; without `stop_at` that is dropped too.
     """
+    processes.allow()
     compilation.enable_cache()
     run = Run(path)
     with lock(run.path):
