@@ -538,7 +538,8 @@ def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
 
     small = all(flat.dtype == "uint8" for flat in flats.values())
     low, high = (
-        np.concatenate([np.zeros(0), *(flat[k] for flat in flats.values())]) for k in (2, 3)
+        np.concatenate([np.zeros(0), *bounds])
+        for bounds in ([x.low for x in flats.values()], [x.high for x in flats.values()])
     )
     return _Flat(at, "uint8" if small and flats else "float32", low, high, write)
 

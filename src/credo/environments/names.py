@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import WrapperSpec
 
 OWN_TEAMS = ("pettingzoo.", "mpe2.")  # modules of teams that are nobody's own code
 ALONE = "name the module, as in mine:{}, or set in_process=True"
@@ -230,8 +231,7 @@ def register(told: dict[str, Any] | None) -> None:
         return
     if told["entry_point"] is None:
         raise Fault("is registered in the process of the script alone", ALONE.format(told["id"]))
-    wrappers = [
-        gymnasium.envs.registration.WrapperSpec(*spec) for spec in told["additional_wrappers"]
+    wrappers = [WrapperSpec(*spec) for spec in told["additional_wrappers"]]
     ]
     gymnasium.register(**{**told, "additional_wrappers": tuple(wrappers)})
 
