@@ -232,7 +232,6 @@ def register(told: dict[str, Any] | None) -> None:
     if told["entry_point"] is None:
         raise Fault("is registered in the process of the script alone", ALONE.format(told["id"]))
     wrappers = [WrapperSpec(*spec) for spec in told["additional_wrappers"]]
-    ]
     gymnasium.register(**{**told, "additional_wrappers": tuple(wrappers)})
 
 
