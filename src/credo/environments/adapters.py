@@ -523,7 +523,7 @@ def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
 
     def write(obs: Any, row: np.ndarray) -> None:
         if not isinstance(obs, kind) or len(obs) != len(writes):
-            told = f"the keys {list(obs)}" if isinstance(obs, Mapping) else type(obs).__name__
+            told = f"the keys {list(obs)}" if isinstance(obs, Mapping) else _kind(obs)
             raise Fault(
                 f"returned {said} of {told}",
                 f"its observation_space says {list(parts)}: make the two agree",
@@ -538,9 +538,15 @@ def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
 
     small = all(flat.dtype == "uint8" for flat in flats.values())
     low, high = (
-        np.concatenate([np.zeros(0), *(flat[k] for flat in flats.values())]) for k in (2, 3)
+        np.concatenate([np.zeros(0), *bounds])
+        for bounds in ([x.low for x in flats.values()], [x.high for x in flats.values()])
     )
     return _Flat(at, "uint8" if small and flats else "float32", low, high, write)
+
+
+def _kind(x: Any) -> str:
+    length = f" and length {len(x)}" if isinstance(x, (tuple, list)) else ""
+    return f"type {type(x).__name__}{length}"
 
 
 def _padded(flat: _Flat, size: int) -> list[Any]:
