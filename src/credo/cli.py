@@ -487,7 +487,7 @@ def _evaluated(run: Any, argv: list[str]) -> list[Any]:
         popped=("--trust", *OF_TASKS),
     )
     in_range(options)
-    if task != env and (changed := _changed(_sizes(env), task, "where it was trained")):
+    if task != env and (changed := _changed(_sizes(env), task, "", " where it was trained")):
         fail(f"with these flags {changed}: its champion cannot act there")
     return [task, options]
 
@@ -592,8 +592,11 @@ def _reproduce(argv: list[str]) -> None:
 
 def _report(argv: list[str]) -> None:
     output, argv = pop_option(argv, "--output", "", "-o")
-    asked = bool({"-h", "--help"} & set(argv))
-    if not argv or any(token.startswith("-") for token in argv):
+    asked = {"-h", "--help"} & set(argv)
+    for token in argv if not asked else ():
+        if token.startswith("-"):
+            fail(f"credo report has no flag {token!r}", token, ("--output", "-o"))
+    if asked or not argv:
         print("usage: credo report RUN [RUN …] [-o report.html]\n\n  one page about finished or")
         print(
             "  running runs, or folders of runs; runs that differ only in their seed are one curve"
@@ -842,7 +845,7 @@ def _began(run: Any) -> Iterator[None]:
     try:
         yield
     except CheckpointError as error:
-        now = _changed(task, run.algorithm.env, "when this run began") if task else ""
+        now = _changed(task, run.algorithm.env, " today", " when this run began") if task else ""
         if not now or "does not fit" not in str(error):
             raise
         raise RunError(f"{now}: go on with the task as it was, or begin a new run") from error
@@ -857,7 +860,7 @@ def _sizes(env: Any) -> dict[str, Any]:
     return {name: getattr(env, name) for name in ("obs_size", "action_size", "agents")}
 
 
-def _changed(before: dict[str, Any], env: Any, when: str) -> str:
+def _changed(before: dict[str, Any], env: Any, today: str, then: str) -> str:
     """What of a task is not what it was, in words, or ""."""
     words = {
         "obs_size": "numbers in an observation",
@@ -866,7 +869,7 @@ def _changed(before: dict[str, Any], env: Any, when: str) -> str:
     }
     now = _sizes(env)
     told = [
-        f"{now[name] or 1} {what} today and {before[name] or 1} {when}"
+        f"{now[name] or 1} {what}{today} and {before[name] or 1}{then}"
         for name, what in words.items()
         if name in before and now[name] != before[name]
     ]

@@ -9,6 +9,7 @@ import contextlib
 import linecache
 import os
 import pathlib
+import select
 import sys
 import tempfile
 import traceback
@@ -95,14 +96,16 @@ def _exit(error: SystemExit) -> Any:
 def _unread() -> bool:
     """Whether nobody reads stdout any more; what is still to be written there goes nowhere."""
     try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        with contextlib.suppress(OSError, ValueError):
-            null = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(null, sys.stdout.fileno())  # Python flushes once more when it ends
-            os.close(null)
-        return True
-    return False
+        number, poll = sys.stdout.fileno(), select.poll()
+        poll.register(number, 0)
+        if not poll.poll(0):
+            return False
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, number)  # Python flushes once more when it ends
+        os.close(null)
+    except (OSError, ValueError, AttributeError):  # no descriptor, or no poll on this system
+        return False
+    return True
 
 
 def _memory(error: BaseException) -> bool:
