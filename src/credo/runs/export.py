@@ -15,7 +15,7 @@ from ..networks.mlp import MLPPolicy
 from ..networks.mmu import MMUPolicy
 from ..networks.recurrent import RecurrentPolicy
 from ..runner import DESCRIPTION, FINGERPRINT, VERSION, Runner, fingerprint
-from . import config
+from . import config, files
 from .loop import Run, RunError
 from .watch import gymnasium_task, opened
 
@@ -37,14 +37,9 @@ def export(run: Run, path: str | pathlib.Path) -> pathlib.Path:
     weights = _weights(policy)
     description = json.dumps(_describe(run, policy))
     metadata = {DESCRIPTION: description, FINGERPRINT: fingerprint(description, weights)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.draft")
-    try:
+    with files.whole(path) as draft:
         draft.write_bytes(safetensors.numpy.save(weights, metadata))
         Runner.load(draft)  # what cannot be read should fail now, not where it is to act
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
     return path
 
 
