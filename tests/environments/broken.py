@@ -137,3 +137,105 @@ class Asks(Grid):
 
 class NoEnv:
     pass
+
+
+class Says(Tiny):
+    """Observes what it is told to, in the space that it is told to have."""
+
+    def __init__(self, space, obs):
+        super().__init__()
+        self.observation_space, self.obs = SPACES[space], OBSERVATIONS[obs]
+
+    def _answer(self, where, action):
+        return self.obs
+
+
+SPACES = {
+    "dict": gymnasium.spaces.Dict(
+        {
+            "pos": Box(-1, 1, (2,)),
+            "kind": Discrete(3),
+            "sub": gymnasium.spaces.Tuple([Box(0, 9, ())]),
+        }
+    ),
+    "box": Box(-1, 1, (2,)),
+    "bytes": Box(0, 255, (2,), np.uint8),
+}
+POS = np.array([0.25, 5.0])  # float64, and outside
+OBSERVATIONS = {
+    "float64": {"pos": POS, "kind": 1, "sub": (np.int64(3),)},
+    "list": {"pos": [0.25, 5], "kind": np.int64(1), "sub": [3.0]},
+    "shape": {"pos": POS[:1], "kind": 1, "sub": (3,)},
+    "kind": {"pos": POS, "kind": 7, "sub": (3,)},
+    "missing": {"pos": POS, "kind": 1},
+    "other": {"pos": POS, "kind": 1, "sup": (3,)},
+    "inner": {"pos": POS, "kind": 1, "sub": (3, 4)},
+    "strings": ["0.5", "1"],
+    "complex": [1j, 0],
+    "objects": np.array([None, 1], object),
+    "whole": np.array([3.0, 255.0]),
+    "part": np.array([0.5, 1.0]),
+    "box": np.array([0.5, 5.0]),
+}
+
+
+class Answers(Tiny):
+    """Says of a step what it is told to."""
+
+    def __init__(self, reward=0.0, terminated=False, truncated=False):
+        super().__init__()
+        self.said = tuple(
+            np.array([x[1:] == "True"]) if str(x)[:1] == "@" else complex(x) if x == "1j" else x
+            for x in (reward, terminated, truncated)
+        )
+
+    def step(self, action):
+        return super().step(action)[0], *self.said, {}
+
+
+class Masked(gymnasium.Env):
+    """Pays the action that was taken; `where` it says which are allowed: 0 and 3, then 1 and 2."""
+
+    action_space = Discrete(4, start=10)
+
+    def __init__(self, where="obs", never=-1):
+        self.where, self.never = where, never
+        mask = {"action_mask": gymnasium.spaces.MultiBinary(4)} if where == "obs" else {}
+        self.observation_space = gymnasium.spaces.Dict({"x": Box(-1, 1, (1,)), **mask})
+
+    def _answer(self):
+        mask = np.array([1, 0, 0, 1] if self.steps % 2 == 0 else [0, 1, 1, 0], np.int8)
+        mask = mask * (self.steps != self.never)
+        obs = {"x": np.zeros(1, np.float32)}
+        return (
+            (obs | {"action_mask": mask}, {})
+            if self.where == "obs"
+            else (
+                obs,
+                {"action_mask": mask},
+            )
+        )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self._answer()
+
+    def step(self, action):
+        self.steps += 1
+        obs, info = self._answer()
+        return obs, float(action), self.steps == 4, False, info
+
+
+def running(limit=4):
+    """A factory, and wrappers that keep statistics."""
+    env = gymnasium.wrappers.NormalizeObservation(Tiny())
+    return gymnasium.wrappers.TimeLimit(gymnasium.wrappers.NormalizeReward(env), limit)
+
+
+class Slow(Tiny):
+    """Every step takes a while, and there are many."""
+
+    def step(self, action):
+        time.sleep(0.02)
+        return super().step(action)[0], 0.0, False, False, {}

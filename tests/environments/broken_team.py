@@ -126,3 +126,96 @@ def parallel_env(**kwargs):
 
 def a_number():
     return 7
+
+
+class Dies(ParallelEnv):
+    """`a` dies at its first step with reward 1, and `b` goes on to the end, unpaid."""
+
+    metadata = {"name": "dies"}
+    possible_agents = ["a", "b"]
+    max_cycles = 4
+
+    def __init__(self, how="terminated"):
+        self.how = how
+
+    def observation_space(self, agent):
+        return Box(-1, 1, (2,), np.float32)
+
+    def action_space(self, agent):
+        return Box(-1, 1, (1,), np.float32)
+
+    def _see(self):
+        both = {"a": np.float32([1, 0]), "b": np.float32([0, 1])}
+        return {agent: both[agent] for agent in self.agents}
+
+    def reset(self, seed=None, options=None):
+        self.agents, self.steps = ["a", "b"], 0
+        return self._see(), {}
+
+    def step(self, actions):
+        self.steps += 1
+        seen, acted = self._see(), self.agents
+        ends = [{x: x == "a" and self.how == kind for x in acted} for kind in ("terminated", "cut")]
+        self.agents = [x for x in acted if not (ends[0][x] or ends[1][x])]
+        return seen, {x: float(x == "a") for x in acted}, *ends, {}
+
+
+class Named(Pair):
+    """Names its rewards in infos; at step `at` it does what `wrong` says."""
+
+    max_cycles = 4
+
+    def __init__(self, wrong="", at=2, **kwargs):
+        super().__init__(**kwargs)
+        self.wrong, self.turn = wrong, at
+
+    def step(self, actions):
+        obs, rewards, *ends, _ = super().step(actions)
+        acted = list(rewards)
+        told = {x: {"global": float(self.steps), "dense": 10.0 * k} for k, x in enumerate(acted)}
+        if self.steps == self.turn and self.wrong:
+            getattr(self, f"_{self.wrong}")(told)
+        return obs, rewards, *ends, {x: {"rewards": told[x]} for x in acted if told[x] is not None}
+
+    def _differ(self, told):
+        told["b"]["global"] = 7.0
+
+    def _silent(self, told):
+        told["b"] = None
+
+    def _private(self, told):
+        del told["b"]["dense"]
+
+    def _new(self, told):
+        told["b"]["other"] = 1.0
+
+    def _one(self, told):  # what all share one may say
+        del told["a"]["global"]
+
+    def _nobody(self, told):
+        del told["a"]["global"], told["b"]["global"]
+
+    def _text(self, told):
+        told["b"]["dense"] = "1.0"
+
+
+class Late(Named):
+    """Names rewards from its second step alone."""
+
+    def step(self, actions):
+        *answer, infos = super().step(actions)
+        return *answer, infos if self.steps > 1 else {}
+
+
+def arrived(env, rewards, infos):
+    """One number for the team."""
+    return 100.0 * env.steps
+
+
+def each(env, rewards, infos):
+    """A number for each."""
+    return {agent: reward + 0.5 for agent, reward in rewards.items()}
+
+
+def fickle(env, rewards, infos):
+    return 1.0 if env.steps < 2 else {"a": 1.0}

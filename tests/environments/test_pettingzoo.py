@@ -161,7 +161,6 @@ def test_an_id_that_pettingzoo_knows():
 
 UNFIT = {
     "Choosing": (pair("Choosing"), r"Discrete\(3\) for 'a': .*continuous_actions=True of mpe2"),
-    "no limit": (PettingZoo("broken_team:Pair"), "no time limit.*: set max_episode_steps"),
     "no maker": (PettingZoo("broken"), "broken has no parallel_env: name a module of PettingZoo"),
     "no such": (pair("Missing"), "broken_team has no Missing"),
     "no team": (pair("a_number"), "is a int: name what makes a pettingzoo.ParallelEnv"),

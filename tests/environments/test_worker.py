@@ -233,7 +233,6 @@ def test_what_the_caller_does_wrong():
 
 
 UNFIT = {
-    "missing limit": (Gymnasium("broken:Tiny"), "no time limit.*: set max_episode_steps"),
     "unbounded": (tiny("Unbounded"), "action space without bounds.*: give its Box a finite low"),
     "other actions": (tiny("Asks"), r"action space MultiBinary\(3\): use a Box or a Discrete"),
     "no env": (tiny("NoEnv"), "is a NoEnv: name a class derived from gymnasium.Env"),
