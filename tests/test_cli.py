@@ -154,9 +154,9 @@ def test_a_wrong_flag_is_answered_with_the_right_one(credo, words, told):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("resume nowhere", "nowhere is not a run: it has no config.json"),
-        ("evaluate nowhere", "nowhere is not a run"),
-        ("report nowhere", "nowhere is not a run"),
+        ("resume nowhere", "nowhere is no run and has none in it"),
+        ("evaluate nowhere", "nowhere is no run"),
+        ("report nowhere", "nowhere is no run"),
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(credo, words, told):

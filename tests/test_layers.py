@@ -15,7 +15,8 @@ LEVELS = [
     {"analysis"},
     {"runs"},
     {"experiments"},
-    {"cli", "__main__"},
+    {"cli"},
+    {"__main__"},
 ]
 LEVEL = {part: level for level, parts in enumerate(LEVELS) for part in parts}
 

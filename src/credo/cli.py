@@ -3,7 +3,6 @@
 Nothing here imports JAX before a command needs it: `credo --help` answers at once.
 """
 
-import contextlib
 import dataclasses
 import importlib
 import os
@@ -12,7 +11,6 @@ import re
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from .runs import ending
@@ -447,18 +445,7 @@ def _resume(argv: list[str]) -> None:
     in_range(options)
     fields = vars(options) | {"wall_clock": seconds(options.wall_clock)}
     fields |= {"set": changes, "trust": trust, "without_replay": without_replay}
-    runs = _runs(path)
-    if len(runs) == 1:
-        print(_summary(_going_on(runs[0], **fields)))
-        return
-    _resume_all(pathlib.Path(path), runs, **fields)
-
-
-def _going_on(path: pathlib.Path, **fields: Any) -> Any:
-    from .runs import loop
-
-    with _began(loop.Run(path, trust=fields["trust"])):
-        return loop.resume(path, **fields)
+    _go_on(pathlib.Path(path), _runs(path), **fields)
 
 
 @dataclasses.dataclass
@@ -487,8 +474,11 @@ def _evaluated(run: Any, argv: list[str]) -> list[Any]:
         popped=("--trust", *OF_TASKS),
     )
     in_range(options)
-    if task != env and (changed := _changed(_sizes(env), task, "where it was trained")):
-        fail(f"with these flags {changed}: its champion cannot act there")
+    if task != env and task.sizes != env.sizes:
+        words = ("numbers in an observation", "numbers in an action", "agents")
+        sizes = zip(words, task.sizes, env.sizes, strict=False)  # who plays alone has two
+        told = [f"{now} {what}" for what, now, then in sizes if now != then]
+        fail(f"with these flags the task has {', and '.join(told)}: its champion cannot act there")
     return [task, options]
 
 
@@ -500,9 +490,8 @@ def _evaluate(argv: list[str]) -> None:
     results = []
     for each in _runs(path):
         run = loop.Run(each, trust=trust)
-        with _began(run):
-            task, options = _evaluated(run, argv)
-            lines, result = evaluation.describe(run, task, options.episodes, options.seed)
+        task, options = _evaluated(run, argv)
+        lines, result = evaluation.describe(run, task, options.episodes, options.seed)
         print("\n".join(lines))
         results += [] if result is None else [result]
     if len(results) > 1:
@@ -532,9 +521,8 @@ def _watch(argv: list[str]) -> None:
     from .runs import loop, watch
 
     run = loop.Run(_one_run("watch", path), trust=trust)
-    with _began(run):
-        target = pathlib.Path(film) if film else None
-        print(f"wrote {watch.watch(run, target, **vars(options))}")
+    target = pathlib.Path(film) if film else None
+    print(f"wrote {watch.watch(run, target, **vars(options))}")
 
 
 def _export(argv: list[str]) -> None:
@@ -548,9 +536,8 @@ def _export(argv: list[str]) -> None:
     from .runs import export, loop
 
     run = loop.Run(_one_run("export", path), trust=trust)
-    with _began(run):
-        target = argv[0] if argv else run.path / "policy.safetensors"
-        print(f"policy: {export.export(run, pathlib.Path(target))}")
+    target = argv[0] if argv else run.path / "policy.safetensors"
+    print(f"policy: {export.export(run, pathlib.Path(target))}")
 
 
 @dataclasses.dataclass
@@ -592,8 +579,11 @@ def _reproduce(argv: list[str]) -> None:
 
 def _report(argv: list[str]) -> None:
     output, argv = pop_option(argv, "--output", "", "-o")
-    asked = bool({"-h", "--help"} & set(argv))
-    if not argv or any(token.startswith("-") for token in argv):
+    asked = {"-h", "--help"} & set(argv)
+    for token in argv if not asked else ():
+        if token.startswith("-"):
+            fail(f"credo report has no flag {token!r}", token, ("--output", "-o"))
+    if asked or not argv:
         print("usage: credo report RUN [RUN …] [-o report.html]\n\n  one page about finished or")
         print(
             "  running runs, or folders of runs; runs that differ only in their seed are one curve"
@@ -625,10 +615,11 @@ def _check(argv: list[str]) -> None:
     env, _ = parse(
         "credo check TASK", _task(name, settings), CheckOptions, argv, flat=True, popped=OF_TASKS
     )
+    from .environments import checks
     from .environments.host import AbstractHostEnvironment
 
     if isinstance(env, AbstractHostEnvironment):
-        say(f"{name}: two copies play two episodes each; of long ones the first minute")
+        say(f"{name}: it is opened and plays for {checks.HOST_SECONDS:g} seconds, at most")
     problems = _problems(env)
     for problem in problems:
         print(f"- {problem}")
@@ -805,14 +796,14 @@ def _one_run(command: str, path: str) -> pathlib.Path:
     return runs[0]
 
 
-def _resume_all(base: pathlib.Path, runs: list[pathlib.Path], **fields: Any) -> None:
-    """Go on with every run that is not finished, in processes of their own; with options that
-    other processes are not told, one after the other."""
+def _go_on(base: pathlib.Path, runs: list[pathlib.Path], **fields: Any) -> None:
+    """Go on with a run, or with several in processes of their own; with options that other
+    processes are not told, one after the other."""
     from .runs import executor, loop
 
-    if fields["set"] or fields["trust"] or fields["without_replay"]:
+    if len(runs) == 1 or fields["set"] or fields["trust"] or fields["without_replay"]:
         for path in runs:
-            print(_summary(_going_on(path, **fields)))
+            print(_summary(loop.resume(path, **fields)))
         return
     told = {name: fields[name] for name in ("wall_clock", "checkpoint_every", "keep")}
     jobs = []
@@ -827,51 +818,6 @@ def _resume_all(base: pathlib.Path, runs: list[pathlib.Path], **fields: Any) -> 
     executor.run(jobs, title=base.name)
     for path in runs:
         print(_summary(loop.Run(path)))
-
-
-@contextlib.contextmanager
-def _began(run: Any) -> Iterator[None]:
-    """An error that comes from a task which is not what it was, or not where it was, when this run
-    began says so."""
-    from .environments.host import EnvironmentFailure
-    from .runs.checkpoint import CheckpointError
-    from .runs.config import ConfigError
-    from .runs.loop import RunError
-
-    task = run.config.get("task", {})  # runs of older versions have none
-    try:
-        yield
-    except CheckpointError as error:
-        now = _changed(task, run.algorithm.env, "when this run began") if task else ""
-        if not now or "does not fit" not in str(error):
-            raise
-        raise RunError(f"{now}: go on with the task as it was, or begin a new run") from error
-    except (ConfigError, EnvironmentFailure) as error:
-        folder = task.get("folder")
-        if folder in (None, _here()) or "No module named" not in str(error):
-            raise
-        raise RunError(f"{error}. This run began in {folder}: start credo there") from error
-
-
-def _sizes(env: Any) -> dict[str, Any]:
-    return {name: getattr(env, name) for name in ("obs_size", "action_size", "agents")}
-
-
-def _changed(before: dict[str, Any], env: Any, when: str) -> str:
-    """What of a task is not what it was, in words, or ""."""
-    words = {
-        "obs_size": "numbers in an observation",
-        "action_size": "numbers in an action",
-        "agents": "agents",
-    }
-    now = _sizes(env)
-    told = [
-        f"{now[name] or 1} {what} today and {before[name] or 1} {when}"
-        for name, what in words.items()
-        if name in before and now[name] != before[name]
-    ]
-    task = getattr(env, "id", type(env).__name__)
-    return f"{task} has {', and '.join(told)}" if told else ""
 
 
 def _summary(run: Any) -> str:

@@ -5,26 +5,25 @@ where nobody reads what is printed. What nobody foresaw leaves its traceback in 
 line names. Nothing here imports JAX.
 """
 
-import contextlib
 import linecache
 import os
 import pathlib
+import select
 import sys
 import tempfile
 import traceback
 from collections.abc import Callable
 from typing import Any
 
+from . import screen
+
 ROOT = str(pathlib.Path(__file__).parents[1]) + os.sep  # Credo's own code
 PIPE, INTERRUPT = 141, 130
 
 
 def say(text: str) -> None:
-    """A line on stderr. One that is closed, full or read by nobody ends no command; what a name out
-    of a file may hold moves no cursor."""
-    text = "".join(c if c.isprintable() or c in "\n\t" else f"\\x{ord(c):02x}" for c in text)
-    with contextlib.suppress(OSError, ValueError):
-        print(text, file=sys.stderr, flush=True)
+    """A line on stderr, if anybody reads it; what a name out of a file may hold moves no cursor."""
+    screen.say("".join(c if c.isprintable() or c in "\n\t" else f"\\x{ord(c):02x}" for c in text))
 
 
 def run(command: Callable[[], Any]) -> None:
@@ -42,16 +41,9 @@ def run(command: Callable[[], Any]) -> None:
 
 
 def open_streams() -> None:
-    """A standard stream that the caller has closed goes nowhere. Else the next file that is
-    opened, a checkpoint say, would take its number, and what is printed."""
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        try:
-            os.fstat(number)
-        except OSError:
-            null = os.open(os.devnull, os.O_RDWR)
-            if null != number:
-                os.dup2(null, number)
-                os.close(null)
+    """A standard stream that the caller has closed goes nowhere, and what is printed there too."""
+    screen.occupy()
+    for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "r+"))  # noqa: SIM115
 
@@ -95,14 +87,16 @@ def _exit(error: SystemExit) -> Any:
 def _unread() -> bool:
     """Whether nobody reads stdout any more; what is still to be written there goes nowhere."""
     try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        with contextlib.suppress(OSError, ValueError):
-            null = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(null, sys.stdout.fileno())  # Python flushes once more when it ends
-            os.close(null)
-        return True
-    return False
+        number, poll = sys.stdout.fileno(), select.poll()
+        poll.register(number, 0)
+        if not poll.poll(0):
+            return False
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, number)  # Python flushes once more when it ends
+        os.close(null)
+    except (OSError, ValueError, AttributeError):  # no descriptor, or no poll on this system
+        return False
+    return True
 
 
 def _memory(error: BaseException) -> bool:

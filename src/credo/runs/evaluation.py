@@ -87,7 +87,8 @@ def _score(values: np.ndarray) -> Score:
 
 def _lines(run: Run, task: Any, result: Result) -> Iterator[str]:
     """What `played` found, for people."""
-    yield f"{run.path}: {result.episodes} fresh episodes, mean ± standard error over episodes"
+    many = "episode" if result.episodes == 1 else "episodes, mean ± standard error over episodes"
+    yield f"{run.path}: {result.episodes} fresh {many}"
     if result.failed:
         all_of = result.episodes + result.failed
         yield f"  {result.failed} of {all_of} episodes failed and are left out"
