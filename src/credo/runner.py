@@ -91,15 +91,15 @@ class Runner:
         return self._units.act(observation, self._step, mask)
 
     def _step(self, x: np.ndarray) -> np.ndarray:
-        output, self._memory = self._network(x, self._memory)
+        with np.errstate(all="ignore"):  # what is not finite is refused below
+            output, self._memory = self._network(x, self._memory)
         return output
 
     def _try(self) -> None:
         """One step: what cannot act should fail now."""
         team = () if self.agents is None else (self.agents,)
         self.reset()
-        with np.errstate(all="ignore"):
-            self._units.own(self._step(np.ones((*team, self.obs_size), np.float32)), None)
+        self._units.own(self._step(np.ones((*team, self.obs_size), np.float32)), None)
         self.reset()
 
 
@@ -127,7 +127,13 @@ class Units:
 
     def act(self, observation: Any, step: Callable[[np.ndarray], Any], mask: Any = None) -> Any:
         """The action in the task's units that follows from `step`, a policy on float32 arrays."""
-        own = self.own(np.asarray(step(self.read(observation))), mask)
+        output = np.asarray(step(self.read(observation)))
+        if not np.isfinite(output).all():
+            raise ValueError(
+                f"the policy's output for {observation!r} is {output}: its weights, or numbers as "
+                "large as these, overflow"
+            )
+        own = self.own(output, mask)
         if isinstance(observation, Mapping):
             return {name: own[k] for k, name in enumerate(self.names) if name in observation}
         if isinstance(own, list):
