@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import equinox as eqx
 
-from ..runs import config, executor
+from ..runs import config, executor, files
 from ..runs.loop import Run, RunError
 from ..runs.page import Page, write
 
@@ -157,10 +157,7 @@ def reproduce(
     }
     if earlier is not None:
         results = merged(earlier, results, every)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    draft = target.with_name(".results.json.draft")
-    draft.write_text(_compact(results))
-    draft.replace(target)
+    files.write_text(target, _compact(results))
     return page(target)
 
 

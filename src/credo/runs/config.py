@@ -11,7 +11,6 @@ import difflib
 import importlib
 import importlib.metadata
 import inspect
-import json
 import os
 import pathlib
 import platform
@@ -32,6 +31,7 @@ from ..learners.manager import AbstractManager
 from ..networks.base import AbstractNetwork
 from ..networks.exploration import AbstractNoise
 from ..networks.mlp import AbstractCritic
+from . import files
 
 EXTENSIONS = (
     AbstractEnvironment,
@@ -187,13 +187,7 @@ def _processor() -> str:
 
 def write_json(path: pathlib.Path, value: Any) -> None:
     """Write a file that is either the old one or the whole new one."""
-    draft = path.with_name(f".{path.name}.draft")
-    with draft.open("w") as file:
-        json.dump(value, file, indent=1, ensure_ascii=False)
-        file.write("\n")
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)
+    files.write_json(path, value)
 
 
 def flatten(tree: Any, path: str = "") -> dict[str, Any]:

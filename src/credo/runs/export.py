@@ -10,7 +10,7 @@ import numpy as np
 import safetensors.numpy
 
 from ..runner import DESCRIPTION, FINGERPRINT, VERSION, Runner, fingerprint
-from . import config
+from . import config, files
 from .loop import Run, RunError
 from .policy import champion, task_of
 
@@ -30,14 +30,9 @@ def export(run: Run, path: str | pathlib.Path) -> pathlib.Path:
     network, weights = parts_of(policy)
     description = json.dumps(_describe(run, network))
     metadata = {DESCRIPTION: description, FINGERPRINT: fingerprint(description, weights)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.draft")
-    try:
+    with files.whole(path) as draft:
         draft.write_bytes(safetensors.numpy.save(weights, metadata))
         Runner.load(draft)  # what cannot be read should fail now, not where it is to act
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
     return path
 
 

@@ -17,6 +17,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from . import files
+
 Cell = str | float | None
 
 
@@ -219,10 +221,8 @@ class Page:
 def write(page: Page, path: str | os.PathLike[str]) -> Path:
     """Write `page` to the HTML file `path` and return it. A reader never sees half a file."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_text(render(page), encoding="utf-8", newline="\n")
-    return partial.replace(path)
+    files.write_text(path, render(page))
+    return path
 
 
 def render(page: Page) -> str:

@@ -27,6 +27,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from ..analysis.statistics import bootstrap_interval
+from . import files
 from .page import Curve, Figure, HeatMap, Reference, Tracks
 
 Floats = NDArray[np.float64]
@@ -117,7 +118,8 @@ def save_png(
         canvas = draw(figure, theme)
         if figure.title:
             canvas.suptitle(textwrap.fill(figure.title, 56), color=theme.ink, fontsize=11)
-        canvas.savefig(path, format="png", dpi=dpi, facecolor=theme.page)
+        with files.whole(path) as draft:
+            canvas.savefig(draft, format="png", dpi=dpi, facecolor=theme.page)
     return Path(path)
 
 

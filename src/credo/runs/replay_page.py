@@ -22,6 +22,7 @@ from ..environments.rover import BRACKETS, Rover
 from ..networks.base import AbstractPolicy
 from ..rollout import world_keys
 from ..types import TimeStep
+from . import files
 from .page import Page, render
 
 SPEEDS = (1, 2, 5, 10, 20)  # steps per second to choose from
@@ -116,10 +117,8 @@ def write(
     path = Path(path)
     page = render(Page(title, lead, command="", sections=[]))
     text = page.replace("</main>", f"{player(env, episodes, speed=speed)}\n</main>")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_text(text, encoding="utf-8", newline="\n")
-    return partial.replace(path)
+    files.write_text(path, text)
+    return path
 
 
 def player(env: Rover, episodes: Sequence[Episode], *, speed: float = 5) -> str:

@@ -17,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from ..environments.rover import Rover
+from . import files
 from .plots import DARK, LIGHT, STYLE, Theme, inline
 from .replay_page import Episode
 
@@ -77,7 +78,8 @@ def save_png(
         if title:
             canvas.set_figheight(SIDE + 0.3)
             canvas.suptitle(textwrap.fill(title, 52), color=theme.ink, fontsize=11)
-        canvas.savefig(path, format="png", dpi=dpi, facecolor=theme.page)
+        with files.whole(path) as draft:
+            canvas.savefig(draft, format="png", dpi=dpi, facecolor=theme.page)
     return Path(path)
 
 

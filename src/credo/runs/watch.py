@@ -23,7 +23,7 @@ from ..environments.gymnasium import Gymnasium
 from ..environments.host import AbstractHostEnvironment
 from ..environments.rover import Rover
 from ..environments.wrappers import DelayedHostReward, DelayedReward
-from . import maze_page, replay_page
+from . import files, maze_page, replay_page
 from .loop import Policy, Run, RunError
 
 FASTEST = 50  # pictures per second: browsers slow a gif down that has more
@@ -120,13 +120,8 @@ def _film(
     write: "Writer", output: pathlib.Path, pictures: Iterator[np.ndarray], rate: float
 ) -> pathlib.Path:
     """Pictures in a file that is there once it is whole."""
-    draft = output.with_name(f".{output.stem}.draft{output.suffix}")
-    output.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with files.whole(output) as draft:
         write(draft, pictures, rate)
-        draft.replace(output)
-    finally:
-        draft.unlink(missing_ok=True)
     return output
 
 
