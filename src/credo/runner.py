@@ -360,7 +360,7 @@ class MLP:
         self._b = claim(f"b_{self._depth}", y)
         self._activation = config["output_activation"]
 
-    def start(self, random: np.random.Generator) -> None:
+    def start(self, random: "np.random.Generator") -> None:
         return None
 
     def __call__(self, x: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
@@ -423,7 +423,7 @@ class MMU:
         if config["start_memory"] == "learned":
             yield "m_0", (m,)
 
-    def start(self, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    def start(self, random: "np.random.Generator") -> tuple[np.ndarray, np.ndarray]:
         w = self.weights
         return np.zeros_like(w["b_y"]), w.get("m_0", np.zeros_like(w["b_w"]))
 
@@ -468,7 +468,7 @@ class Recurrent:
             shapes = {f"W_{gate}": (h, x), f"U_{gate}": (h, h), f"b_{gate}": (h,)}
             self.weights |= {name: claim(name, *shape) for name, shape in shapes.items()}
 
-    def start(self, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    def start(self, random: "np.random.Generator") -> tuple[np.ndarray, np.ndarray]:
         zeros = np.zeros(self.weights["Z_y"].shape[1], np.float32)
         return zeros, zeros
 
@@ -512,7 +512,7 @@ class Team:
         size = self._trunks[0].size
         self._heads = each(own_heads, lambda k: part(k, f"heads.{k}", size, y))
 
-    def start(self, random: np.random.Generator) -> list[Any]:
+    def start(self, random: "np.random.Generator") -> list[Any]:
         return [head.start(random) for head in self._heads]
 
     def __call__(self, x: np.ndarray, memory: list[Any]) -> tuple[np.ndarray, list[Any]]:
@@ -541,7 +541,7 @@ class DMMU:
         # Of GRUs and Elman networks the state itself is shared, of LSTMs the cell.
         self._swapped = [getattr(agent, "cell", "lstm") != "lstm" for agent in self._agents]
 
-    def start(self, random: np.random.Generator) -> Any:
+    def start(self, random: "np.random.Generator") -> Any:
         own, m = self._turned(0, self._agents[0].start(random))
         return [np.zeros_like(own)] * len(self._agents), m, random
 
@@ -573,7 +573,7 @@ class Centralized:
     def __init__(self, config: Any, claim: Claim, x: int, y: int, agents: int, part: Any):
         self._inner, self._agents = part(0, "policy", agents * x, agents * y), agents
 
-    def start(self, random: np.random.Generator) -> Any:
+    def start(self, random: "np.random.Generator") -> Any:
         return self._inner.start(random)
 
     def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
@@ -594,7 +594,7 @@ class Normalized:
             raise ValueError(f"std is {self._std}: it must be more than 0")
         self._inner = part(0, "policy", x, y, agents)
 
-    def start(self, random: np.random.Generator) -> Any:
+    def start(self, random: "np.random.Generator") -> Any:
         return self._inner.start(random)
 
     def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
