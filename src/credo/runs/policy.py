@@ -92,7 +92,7 @@ def _network_alone(tree: dict[str, Any], task: Mapping[str, Any]) -> PyTree:
     like = eqx.filter_eval_shape(network.init, *sizes, *team, key=jax.random.key(0))
     if not tree.get("normalize_observations", False):
         return like
-    from ..networks.normalized import Normalized
+    from ..networks.normalized import Normalized  # pyright: ignore[reportMissingImports]
 
     shape = jax.ShapeDtypeStruct((units.obs_size,), jnp.float32)
     return Normalized(like, shape, shape)
