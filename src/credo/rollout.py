@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from . import tree
 from .compilation import jit
 from .environments.base import AbstractEnvironment, AbstractSequenceTask, correct
-from .environments.host import AbstractHostEnvironment
+from .environments.host import AbstractHostEnvironment, Episodes
 from .networks.base import AbstractPolicy
 from .types import Evaluation, Sequence, Transition
 
@@ -92,15 +92,16 @@ def score(
 def blank(env: Environment) -> Transition:
     """A transition of this task, all zeros: its shapes and types."""
     obs_size, action_size, *team = env.sizes
-    obs, action, ended = jnp.zeros((*team, obs_size)), jnp.zeros((*team, action_size)), jnp.bool_(0)
+    obs = jnp.zeros((*team, obs_size), getattr(env, "obs_dtype", "float32"))
+    action = jnp.zeros((*team, action_size))
     if isinstance(env, AbstractHostEnvironment):
         rewards = {name: jnp.zeros(shape) for name, shape in env.reward_shapes.items()}
-        active = jnp.zeros(team, bool) if team else None
+        ended, active = jnp.zeros(team, bool), jnp.zeros(team, bool) if team else None
     else:
         _, first = jax.eval_shape(lambda: env.reset(key=jax.random.key(0)))
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), first)
-        rewards, active = zeros.rewards, zeros.active
-    return Transition(obs, action, rewards, obs, ended, ended, active)
+        rewards, ended, active = zeros.rewards, zeros.ended, zeros.active
+    return Transition(obs, action, rewards, obs, ended, jnp.bool_(False), active)
 
 
 def world_keys(pop: int, episodes: int, common: bool, *, key: PRNGKeyArray) -> PRNGKeyArray:
@@ -180,8 +181,8 @@ def _play(
         )
         steps = steps + active.astype(jnp.int32)
         if record:
-            ends = (step.terminated, step.truncated)
-            row = (Transition(obs, actions, step.rewards, step.obs, *ends, acting), active)
+            ends = (step.ended, step.truncated, acting)
+            row = (Transition(obs, actions, step.rewards, step.obs, *ends), active)
             rows = jax.tree.map(lambda xs, x: xs.at[t].set(x), rows, row)
         active = active & ~(step.terminated | step.truncated)
         seen = (step.obs, step.active)
@@ -223,45 +224,19 @@ def _play_on_host(
     leaves, structure = jax.tree.flatten(population)
     arrays = [x if eqx.is_array(x) else None for x in leaves]
     start, act = _programs(structure, tuple(None if eqx.is_array(x) else x for x in leaves))
-    seeds, carry = start(arrays, (pop, episodes), common, key)
-    copies = env.copies(pop * episodes)
-    active = np.tile(np.arange(episodes) < int(wanted), pop)
-    lost = np.zeros_like(active)  # as in `_play`, by the policy; copies never say NaN
-    totals = {name: np.zeros((active.size, *shape)) for name, shape in env.reward_shapes.items()}
-    steps, rows, valid = np.zeros(active.shape, np.int32), [], []
-    acting = None if env.agents is None else np.ones((active.size, env.agents), bool)
-    obs = copies.reset(np.asarray(seeds).reshape(-1), active)
-    for _ in range(env.max_steps):
-        action, carry = act(arrays, obs, carry)
-        action = np.asarray(action)
-        nan = ~np.isfinite(action)
-        lost = lost | (active & nan.reshape(active.size, -1).any(axis=1))
-        action = np.where(nan, np.float32(0.0), action)
-        step = copies.step(action, active)
-        for name, reward in step.rewards.items():
-            totals[name] += np.where(_over(active, reward), reward, 0.0)
-        steps += active
-        if record:
-            ends = (step.terminated, step.truncated)
-            rows.append((obs, action, step.rewards, step.obs, *ends, acting))
-            valid.append(active)
-        active = active & ~(step.terminated | step.truncated)
-        obs, acting = step.obs, step.active
-        if not active.any():
-            break
-
-    def kept(*xs):
-        x = np.stack(xs, axis=1)[np.stack(valid, axis=1) & ~lost[:, None]]
-        return x.astype(np.float32) if x.dtype == np.float64 else x
-
-    for total in totals.values():
-        total[lost] = np.nan
-    lanes = (pop, episodes)
-    told = jax.tree.map(lambda x: jnp.asarray(x.reshape(*lanes, *x.shape[1:])), (totals, steps))
-    played = Evaluation(*told)
+    seeds, first = start(arrays, (pop, episodes), common, key)
+    told = Episodes(env, pop * episodes, record)
+    for turn in env.turns(np.tile(np.arange(episodes) < int(wanted), pop)):
+        obs, carry = told.begin(np.asarray(seeds).reshape(-1), turn), first
+        while told.ongoing:
+            action, carry = act(arrays, obs, carry)
+            obs = told.advance(np.asarray(action))
+    sums = jax.tree.map(
+        lambda x: jnp.asarray(x.reshape(pop, episodes, *x.shape[1:])), (told.returns(), told.steps)
+    )
     if not record:
-        return played, None
-    return played, Experience(Transition(*jax.tree.map(kept, *rows)), None)
+        return Evaluation(*sums), None
+    return Evaluation(*sums), Experience(Transition(*told.rows()), None)
 
 
 @functools.lru_cache(maxsize=64)
@@ -281,7 +256,7 @@ def _programs(structure, rest: tuple):
 
     def act(arrays, obs, carry):
         pop = next(x.shape[0] for x in arrays if x is not None)
-        obs = obs.reshape(pop, -1, *obs.shape[1:])
+        obs = obs.reshape(pop, -1, *obs.shape[1:]).astype(jnp.float32)
         actions, carry = _act(policies(arrays), obs, carry)
         return actions.reshape(-1, *actions.shape[2:]), carry
 

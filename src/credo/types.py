@@ -11,7 +11,8 @@ class TimeStep(eqx.Module):
     """What an environment says after `reset` or one `step` (one episode, no batch).
 
     For a team, `obs` has a leading agent axis, a reward is a scalar (shared) or `[agents]`
-    (private), and `active` says who acts at the next step (busy, joined or left).
+    (private), `active` says who acts at the next step (busy, joined or left), and `gone` for whom
+    the task ended with this step, whoever goes on: its value ends, its truncation is not in it.
     """
 
     obs: Float[Array, "..."]
@@ -19,6 +20,13 @@ class TimeStep(eqx.Module):
     terminated: Bool[Array, ""]  # the task ended: do not bootstrap
     truncated: Bool[Array, ""]  # the clock ran out: do bootstrap
     active: Bool[Array, " agents"] | None = None
+    gone: Bool[Array, " agents"] | None = None  # None: nobody before the episode ends
+
+    @property
+    def ended(self) -> Bool[Array, "*agents"]:
+        """For whom the task ended: do not bootstrap. Of each agent, where `gone` tells them
+        apart."""
+        return self.terminated if self.gone is None else self.terminated[..., None] | self.gone
 
 
 class Sequence(eqx.Module):
@@ -57,7 +65,7 @@ class Transition(eqx.Module):
     action: Float[Array, "*rows act"]
     rewards: dict[str, Float[Array, "*rows"]]
     next_obs: Float[Array, "*rows obs"]
-    terminated: Bool[Array, "*rows"]  # the task ended
+    terminated: Bool[Array, "*rows"]  # the task ended; by agent where agents end on their own
     truncated: Bool[Array, "*rows"]  # the clock ran out
     active: Bool[Array, "*rows agents"] | None = None  # whose action counted; None: everybody's
 

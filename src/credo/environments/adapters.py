@@ -10,78 +10,139 @@ import inspect
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy as np
 
+from . import names
+from .names import Fault
+
+MOST_STEPS = 1000  # of an episode, where neither the task nor its user names a limit
 NO_LIMIT = (
-    "set max_episode_steps, the steps after which an episode is truncated: on the command "
-    "line --max-episode-steps 1000, say"
+    f"it names no time limit: an episode is truncated after {MOST_STEPS:,} steps; set "
+    "max_episode_steps, on the command line --max-episode-steps 1000, say"
 )
-
-
-class Fault(Exception):
-    """What an environment did wrong (`what`), and what to do about it (`fix`)."""
-
-    def __init__(self, what: str, fix: str):
-        super().__init__(what, fix)
-        self.what, self.fix = what, fix
+LASTING = {
+    "NormalizeObservation": "set normalize_observations of the algorithm, which keeps the "
+    "statistics with the policy",
+    "NormalizeReward": "scale the reward by a constant, for example by the learner's reward_scale",
+}
+"""Wrappers whose state outlives an episode, by class name, and what to use instead."""
 
 
 class Single:
-    """What all copies of a Gymnasium environment have in common, taken from the first."""
+    """What all copies of a Gymnasium environment have in common, taken from the first.
+
+    Of a Discrete action the largest entry is taken: the largest that is allowed, where
+    `action_mask` of a Dict observation, or of `info`, says which are.
+    """
 
     agents: ClassVar[int | None] = None
+    signals: ClassVar[list[tuple[str, bool]]] = [("reward", False)]  # name, private to an agent
 
     @staticmethod
     def make(spec: dict[str, Any]) -> gymnasium.Env:
-        """One environment, by its Gymnasium id, as `package.module:Class`, or by an id that a
-        module registers when it is imported: `package.module:Name-v0`."""
-        module, _, name = spec["id"].partition(":")
-        cls = getattr(importlib.import_module(module), name, None) if name.isidentifier() else None
-        if cls is None:
+        """One environment, by its Gymnasium id, as `package.module:name` of a class or of a
+        function that makes one, or by an id that a module registers when it is imported:
+        `package.module:Name-v0`."""
+        id, kwargs, (module, _, name) = spec["id"], spec["kwargs"], spec["id"].partition(":")
+        if not name or (names.find(id) is None and not names.here_alone(id)):
             if name:
                 importlib.import_module(module)
-            return _registered(name or module, spec["kwargs"], spec["max_episode_steps"])
+            names.register(spec.get("registered"))
+            return _registered(name or module, kwargs, spec["max_episode_steps"])
+        maker = names.resolve(id, gymnasium.Env)
         _hear_mujoco()
-        env = cls(**spec["kwargs"])
+        env = maker(**kwargs)
         if not isinstance(env, gymnasium.Env):
-            raise Fault(f"is a {type(env).__name__}", "name a class derived from gymnasium.Env")
+            raise Fault(f"is a {type(env).__name__}", "name what makes a gymnasium.Env")
         return env
 
-    def __init__(self, env: gymnasium.Env, limit: int | None):
-        self.max_steps = _time_limit(env, limit)
-        self.obs_size, self._write = _observations(env.observation_space)
+    def __init__(self, env: gymnasium.Env, spec: dict[str, Any]):
+        self.warnings = _lasting(env)
+        self.max_steps = self._limit(env, spec["max_episode_steps"])
+        flat = _flat(env.observation_space)
+        self.obs_size, self._write, self.obs_dtype = flat.size, flat.write, flat.dtype
+        self.obs_range = flat.bounds
+        self.observations = _choice(env.observation_space)
         self.action_size, self.read = _actions(env.action_space)
+        self.actions = _described(env.action_space)
         self.discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
+        self._masks: dict[int, np.ndarray] = {}  # by copy: which actions it allows next
+        if self.discrete:
+            self._choose, self.read = self.read, self._allowed
+            spaces = getattr(env.observation_space, "spaces", {})
+            mask = spaces.get("action_mask") if isinstance(spaces, dict) else None
+            self._seen = mask is not None and mask.shape == (self.action_size,)
+
+    def _limit(self, env: gymnasium.Env, limit: int | None) -> int:
+        limits = [] if limit is None else [limit]
+        while isinstance(env, gymnasium.Wrapper):
+            if isinstance(env, gymnasium.wrappers.TimeLimit):
+                limits.append(env._max_episode_steps)
+            env = env.env
+        if not limits:
+            self.warnings.append(NO_LIMIT)
+        return min(limits, default=MOST_STEPS)
 
     def reset(self, env: gymnasium.Env, seed: int, frame: Any, i: int) -> None:
         """A fresh episode of copy `i`, written to its row of the frame."""
         result = env.reset(seed=seed)
         _count(result, 2, "reset", "(observation, info)")
         self._write(result[0], frame.obs[i])
+        if self.discrete:
+            self._allow(*result, i)
 
     def step(self, env: gymnasium.Env, action: Any, frame: Any, i: int) -> bool:
         """One step of copy `i`, written to its row; whether the episode is over."""
         result = env.step(action)
         _count(result, 5, "step", "(observation, reward, terminated, truncated, info)")
-        obs, reward, terminated, truncated, _ = result
+        obs, reward, terminated, truncated, info = result
         self._write(obs, frame.obs[i])
-        frame.rewards[i] = reward if isinstance(reward, (float, int)) else _number(reward)
-        frame.terminated[i] = terminated
-        frame.truncated[i] = truncated
-        return terminated or truncated
+        frame.rewards["reward"][i] = reward if isinstance(reward, (float, int)) else _number(reward)
+        terminated, truncated = _flag("terminated", terminated), _flag("truncated", truncated)
+        frame.terminated[i], frame.truncated[i] = terminated, truncated
+        over = terminated or truncated
+        if self.discrete and not over:
+            self._allow(obs, info, i)
+        return over
+
+    def _allow(self, obs: Any, info: Any, i: int) -> None:
+        """Remember what copy `i` allows next, as far as it says."""
+        says = obs if self._seen else info
+        mask = says.get("action_mask") if isinstance(says, Mapping) else None
+        if mask is None:
+            self._masks.pop(i, None)
+            return
+        mask = np.asarray(mask)
+        if mask.shape != (self.action_size,) or mask.dtype.kind not in "biu":
+            raise Fault(
+                f"returned an action_mask of shape {mask.shape} and dtype {mask.dtype}",
+                f"give one number, 0 or 1, for each of the {self.action_size} actions",
+            )
+        if not mask.any():
+            raise Fault("allows no action: its action_mask is 0 everywhere", "allow one, or end")
+        self._masks[i] = mask.astype(bool)
+
+    def _allowed(self, actions: np.ndarray) -> np.ndarray:
+        if self._masks:
+            actions = actions.copy()
+            for i, mask in self._masks.items():
+                actions[i, ~mask] = -np.inf
+        return self._choose(actions)
 
 
 class Team:
     """What all copies of a `ParallelEnv` have in common, taken from the first.
 
     Agents keep the order of `possible_agents`. Observations are padded with zeros to the largest,
-    and of an action each agent is given as much as its own Box holds.
+    and of an action each agent is given as much as its own Box holds. The rewards' names are
+    looked up in one step of the first copy (`_Pay`).
     """
 
     discrete = False
+    observations: ClassVar[None] = None
 
     @staticmethod
     def make(spec: dict[str, Any]) -> Any:
@@ -91,13 +152,18 @@ class Team:
         if id in getattr(pettingzoo, "parallel_registry", ()):  # since 1.27
             env = pettingzoo.make("parallel", id, **kwargs)
         else:
-            env = _called(id, kwargs)
+            env = _called(id, kwargs, pettingzoo.ParallelEnv)
         if not isinstance(env, pettingzoo.ParallelEnv):
-            raise Fault(f"is a {type(env).__name__}", "name what makes a pettingzoo.ParallelEnv")
+            raise Fault(
+                f"is a {type(env).__name__}",
+                "name what makes a pettingzoo.ParallelEnv; pettingzoo.utils.aec_to_parallel turns "
+                "an AECEnv into one",
+            )
         return env
 
-    def __init__(self, env: Any, limit: int | None):
-        self.max_steps = _cycles(env, limit)
+    def __init__(self, env: Any, spec: dict[str, Any]):
+        self.warnings = _lasting(env)
+        self.max_steps = self._cycles(env, spec["max_episode_steps"])
         self._names: list[str] = list(getattr(env, "possible_agents", ()))
         if not self._names:
             raise Fault("has no possible_agents", "name there every agent that an episode may have")
@@ -105,12 +171,38 @@ class Team:
         self._rows = {name: k for k, name in enumerate(self._names)}
         for name in self._names:
             _box(name, env.action_space(name))
-        observations = [_observations(env.observation_space(name)) for name in self._names]
+        flats = [_flat(env.observation_space(name)) for name in self._names]
         actions = [_actions(env.action_space(name)) for name in self._names]
-        self.obs_size = max(size for size, _ in observations)
+        self.actions = [_described(env.action_space(name)) for name in self._names]
+        self.obs_size = max(flat.size for flat in flats)
+        self.obs_dtype = "uint8" if all(x.dtype == "uint8" for x in flats) else "float32"
+        self.obs_range = [_padded(flat, self.obs_size) for flat in flats]
         self.action_size = max(size for size, _ in actions)
-        self._observations, self._actions = observations, actions
+        self._writes = [(flat.size, flat.write) for flat in flats]
+        self._actions = actions
         self._owing: dict[int, set[str]] = {}  # by copy: who was there and has not terminated
+        self._pay = _Pay(self._rows, spec)
+        self._pay.learn(env, *self._first_step(env))
+        self.signals = self._pay.signals
+
+    def _cycles(self, env: Any, limit: int | None) -> int:
+        """PettingZoo has no wrapper for time limits; `max_cycles` is its custom."""
+        limits = [limit, getattr(env.unwrapped, "max_cycles", None)]
+        limits = [int(limit) for limit in limits if limit is not None]
+        if not limits:
+            self.warnings.append(NO_LIMIT)
+        return min(limits, default=MOST_STEPS)
+
+    def _first_step(self, env: Any) -> tuple[list[str], Any, Any]:
+        """Who acted in a first step with the middle of every Box, their rewards and infos."""
+        _count(env.reset(seed=0), 2, "reset", "(observations, infos)")
+        acted = self._here(env)
+        if not acted:
+            return [], {}, {}
+        middle = self.read(np.zeros((1, self.agents, self.action_size), np.float32))[0]
+        result = env.step({name: middle[self._rows[name]] for name in acted})
+        _count(result, 5, "step", TEAM_STEP)
+        return acted, result[1], result[4]
 
     def read(self, actions: np.ndarray) -> list[tuple[np.ndarray, ...]]:
         """Actions `[n, agents, act]` in [-1, 1] as each copy's, agent by agent."""
@@ -127,16 +219,17 @@ class Team:
     def step(self, env: Any, action: Any, frame: Any, i: int) -> bool:
         acted = self._here(env)
         result = env.step({name: action[self._rows[name]] for name in acted})
-        parts = "(observations, rewards, terminations, truncations, infos)"
-        _count(result, 5, "step", parts)
-        obs, rewards, terminations, truncations, _ = result
+        _count(result, 5, "step", TEAM_STEP)
+        obs, rewards, terminations, truncations, infos = result
         owing, left = self._owing[i], set()
+        self._pay(env, acted, rewards, infos, frame.rewards, i)
         for name in acted:
-            frame.rewards[i, self._rows[name]] = _number(_said("reward", rewards, name))
-            terminated = bool(_said("termination", terminations, name))
+            terminated = _flag("a termination", _said("termination", terminations, name))
             if terminated:
                 owing.discard(name)
-            if terminated or bool(_said("truncation", truncations, name)):
+                frame.gone[i, self._rows[name]] = True
+            truncated = _flag("a truncation", _said("truncation", truncations, name))
+            if terminated or truncated:
                 left.add(name)
         here = [name for name in self._here(env) if name not in left]
         owing.update(here)
@@ -156,23 +249,129 @@ class Team:
     def _write(self, obs: Any, names: list[str], frame: Any, i: int) -> None:
         for name in names:
             k = self._rows[name]
-            size, write = self._observations[k]
+            size, write = self._writes[k]
             write(_said("observation", obs, name), frame.obs[i, k, :size])
 
 
-def _called(id: str, kwargs: dict[str, Any]) -> Any:
+TEAM_STEP = "(observations, rewards, terminations, truncations, infos)"
+
+
+class _Pay:
+    """The named rewards of a team, and how they are read from what a step returns.
+
+    `info["rewards"]`, a dict by name, of every agent that acted; a function per name, if the task
+    was given one; and for what neither says: `local` is the environment's own reward, `global` the
+    mean of it over all agents. Names in `shared`, and what a function says as one number, are one
+    number for the team; every other reward is private.
+    """
+
+    def __init__(self, rows: dict[str, int], spec: dict[str, Any]):
+        self._rows = rows
+        self._shared = frozenset(spec.get("shared", ("global",)))
+        self._made = {name: names.resolve(at) for name, at in spec.get("rewards") or ()}
+        self._told: tuple[str, ...] = ()  # by info
+        self.signals: list[tuple[str, bool]] = []  # name, private to an agent
+
+    def learn(self, env: Any, acted: list[str], rewards: Any, infos: Any) -> None:
+        """Which rewards there are, from one step."""
+        told = _named(infos, acted[0]) if acted else None
+        private = {"global": False, "local": True}
+        private |= {name: name not in self._shared for name in told or ()}
+        for name, pay in self._made.items():
+            private[name] = not acted or isinstance(pay(env, dict(rewards), dict(infos)), Mapping)
+        self.signals = list(private.items())
+        self._told = tuple(name for name in told or () if name not in self._made)
+        self._private = private
+        self._mean = "global" not in {*self._told, *self._made}
+        self._own = "local" not in {*self._told, *self._made}
+
+    def __call__(
+        self, env: Any, acted: list[str], rewards: Any, infos: Any, paid: dict[str, Any], i: int
+    ) -> None:
+        """Write the rewards of copy `i`, `paid[name]` `[n]` or `[n, agents]`."""
+        local = paid["local"][i] if self._own else np.zeros(len(self._rows))
+        for name in acted:
+            local[self._rows[name]] = _number(_said("reward", rewards, name))
+        if self._mean:
+            paid["global"][i] = local.mean()
+        if self._told:
+            self._read(acted, infos, paid, i)
+        elif acted and _named(infos, acted[0]) is not None:
+            raise Fault("names rewards in an info, and named none in its first step", NAMED)
+        for name, pay in self._made.items():
+            self._call(name, pay(env, dict(rewards), dict(infos)), paid[name], i)
+
+    def _read(self, acted: list[str], infos: Any, paid: dict[str, Any], i: int) -> None:
+        common: dict[str, Any] = {}
+        for agent in acted:
+            said = _named(infos, agent)
+            if said is None:
+                raise Fault(f"returned no info[{'rewards'!r}] of {agent!r}", NAMED)
+            for name in self._told:
+                if self._private[name]:
+                    if name not in said:
+                        raise Fault(f"returned no reward {name!r} in the info of {agent!r}", NAMED)
+                    paid[name][i, self._rows[agent]] = _number(said[name])
+                elif name in said:
+                    reward = _number(said[name])
+                    if common.setdefault(name, reward) != reward:
+                        raise Fault(
+                            f"returned the reward {name!r} as {common[name]!r} and, of {agent!r}, "
+                            f"as {reward!r}",
+                            "a shared reward is one number for the team: say the same of every "
+                            f"agent, or give PettingZoo(..., shared=()) without {name!r}",
+                        )
+            strange = [name for name in said if name not in self._private]
+            if strange:
+                raise Fault(f"names the reward {strange[0]!r}, which its first step did not", NAMED)
+        for name in self._told:
+            if not self._private[name]:
+                if name not in common:
+                    raise Fault(f"returned no reward {name!r} in any info", NAMED)
+                paid[name][i] = common[name]
+
+    def _call(self, name: str, said: Any, paid: np.ndarray, i: int) -> None:
+        if isinstance(said, Mapping) != self._private[name]:
+            kinds = "a dict by agent" if self._private[name] else "one number"
+            raise Fault(
+                f"was paid {name!r} as a {type(said).__name__}",
+                f"let its function return {kinds} at every step, as at the first",
+            )
+        if not self._private[name]:
+            paid[i] = _number(said)
+            return
+        for agent, reward in said.items():
+            if agent not in self._rows:
+                raise Fault(f"was paid {name!r} for {agent!r}", "name agents of possible_agents")
+            paid[i, self._rows[agent]] = _number(reward)
+
+
+NAMED = (
+    'give info["rewards"], a dict with the same names at every step, to every agent that acted; '
+    "what all share one of them may say"
+)
+
+
+def _named(infos: Any, agent: str) -> Mapping[str, Any] | None:
+    """`info["rewards"]` of one agent, if it has such a dict."""
+    info = infos.get(agent) if isinstance(infos, Mapping) else None
+    said = info.get("rewards") if isinstance(info, Mapping) else None
+    return said if isinstance(said, Mapping) else None
+
+
+def _called(id: str, kwargs: dict[str, Any], kind: type) -> Any:
     """What `package.module:name`, or a module's `parallel_env`, makes."""
     name, _, entry = id.partition(":")
-    module = importlib.import_module(name)
-    maker = getattr(module, entry or "parallel_env", None)
-    if maker is None:
+    id = f"{name}:{entry or 'parallel_env'}"
+    if names.find(id) is None and not names.here_alone(id):
         raise Fault(
             f"is no team task: {name} has no {entry or 'parallel_env'}",
             "name a module of PettingZoo, such as mpe2.simple_spread_v3, or as package.module:name "
             "what makes a ParallelEnv",
         )
+    maker = names.resolve(id, kind)
     # mpe2 hides the arguments of its parallel_env behind **kwargs.
-    makers = [maker] if entry else [maker, getattr(module, "raw_env", maker)]
+    makers = [maker] if entry else [maker, getattr(sys.modules[name], "raw_env", maker)]
     if any("continuous_actions" in inspect.signature(m).parameters for m in makers):
         kwargs = {"continuous_actions": True} | kwargs
     return maker(**kwargs)
@@ -198,15 +397,6 @@ def _box(name: str, space: gymnasium.Space) -> None:
         )
 
 
-def _cycles(env: Any, limit: int | None) -> int:
-    """PettingZoo has no wrapper for time limits; `max_cycles` is its custom."""
-    limits = [limit, getattr(env.unwrapped, "max_cycles", None)]
-    limits = [int(limit) for limit in limits if limit is not None]
-    if not limits:
-        raise Fault("has no time limit: an episode might never end", NO_LIMIT)
-    return min(limits)
-
-
 def _registered(id: str, kwargs: dict[str, Any], max_episode_steps: int | None) -> gymnasium.Env:
     with warnings.catch_warnings():  # -v4 tasks are asked for on purpose
         warnings.filterwarnings("ignore", r".*is out of date", DeprecationWarning)
@@ -230,48 +420,141 @@ def _tell(warning: str) -> None:
         print(f"MuJoCo: {warning}", file=sys.stderr)
 
 
-def _time_limit(env: gymnasium.Env, limit: int | None) -> int:
-    limits = [] if limit is None else [limit]
-    while isinstance(env, gymnasium.Wrapper):
-        if isinstance(env, gymnasium.wrappers.TimeLimit):
-            limits.append(env._max_episode_steps)
-        env = env.env
-    if not limits:
-        raise Fault("has no time limit: an episode might never end", NO_LIMIT)
-    return min(limits)
+def _lasting(env: Any) -> list[str]:
+    """Warnings of wrappers whose state outlives an episode."""
+    kinds: dict[str, None] = {}
+    for _ in range(100):  # layers
+        kinds |= {cls.__name__: None for cls in type(env).__mro__}
+        env = getattr(env, "__dict__", {}).get("env")
+    return [
+        f"its wrapper {name} keeps statistics from episode to episode, in every copy its own, so "
+        f"that training, tests and later use are different tasks: leave it out and {instead}"
+        for name, instead in LASTING.items()
+        if name in kinds
+    ]
 
 
-def _observations(space: gymnasium.Space) -> tuple[int, Callable[[Any, np.ndarray], None]]:
-    """Size of a flat observation, and how to write one into a row of float32.
+class _Flat(NamedTuple):
+    """An observation space as one row of numbers.
 
     Box: flattened. Discrete: one-hot. What is made of them: one after the other.
     """
-    shape = space.shape
 
-    def write_box(obs: Any, row: np.ndarray) -> None:
-        obs = np.asarray(obs)
-        if obs.shape != shape:
-            raise Fault(
-                f"returned an observation of shape {obs.shape}",
-                f"its observation_space says {shape}: make the two agree",
-            )
-        row[:] = obs.ravel()
+    size: int
+    dtype: str  # "uint8" if it is made of Boxes of uint8 alone, else "float32"
+    low: np.ndarray  # [size], float64
+    high: np.ndarray
+    write: Callable[[Any, np.ndarray], None]  # an observation into a row
 
-    def write_other(obs: Any, row: np.ndarray) -> None:
-        if not space.contains(obs):
-            raise Fault(
-                f"returned the observation {obs!r}",
-                f"its observation_space is {space}: make the two agree",
-            )
-        row[:] = gymnasium.spaces.flatten(space, obs)
+    @property
+    def bounds(self) -> list[Any]:
+        """The least and the largest of each number; one number where all are the same."""
+        return [x[0] if x.size and (x == x[0]).all() else x.tolist() for x in self[2:4]]
 
+
+def _flat(space: gymnasium.Space, said: str = "an observation") -> _Flat:
+    spaces = gymnasium.spaces
     if not space.is_np_flattenable:
         raise Fault(
             f"has the observation space {space}",
             "use a Box, a Discrete, or a Dict or Tuple of them",
         )
-    box = isinstance(space, gymnasium.spaces.Box)
-    return gymnasium.spaces.flatdim(space), write_box if box else write_other
+    if isinstance(space, spaces.Box):
+        low, high = (np.float64(bound).ravel() for bound in (space.low, space.high))
+        small = space.dtype == np.uint8
+        write = _box_writer(space, said)
+        return _Flat(low.size, "uint8" if small else "float32", low, high, write)
+    if isinstance(space, spaces.Dict):
+        return _joined(space, dict(space.spaces), Mapping, said)
+    if isinstance(space, spaces.Tuple):
+        return _joined(space, dict(enumerate(space.spaces)), (tuple, list), said)
+
+    def write_other(obs: Any, row: np.ndarray) -> None:
+        if not space.contains(obs):
+            raise Fault(
+                f"returned {said} of {obs!r}",
+                f"its observation_space is {space}: make the two agree",
+            )
+        row[:] = spaces.flatten(space, obs)
+
+    size = spaces.flatdim(space)
+    return _Flat(size, "float32", np.zeros(size), np.ones(size), write_other)
+
+
+def _box_writer(space: Any, said: str) -> Callable[[Any, np.ndarray], None]:
+    """The shape decides; every kind of real number is cast. Bounds are not looked at."""
+    shape, small = space.shape, space.dtype == np.uint8
+
+    def write(obs: Any, row: np.ndarray) -> None:
+        obs = np.asarray(obs)
+        if obs.shape != shape:
+            raise Fault(
+                f"returned {said} of shape {obs.shape}",
+                f"its observation_space says {shape}: make the two agree",
+            )
+        if obs.dtype.kind not in "fuib":
+            raise Fault(f"returned {said} of dtype {obs.dtype}", "return real numbers")
+        if small and obs.dtype != np.uint8 and row.dtype == np.uint8:
+            whole = obs.astype(np.uint8)
+            if not np.array_equal(whole, obs):
+                raise Fault(
+                    f"returned {said} of dtype {obs.dtype} that uint8 cannot hold",
+                    "its observation_space says uint8: make the two agree",
+                )
+            obs = whole
+        row[:] = obs.ravel()
+
+    return write
+
+
+def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
+    """The parts of a Dict or Tuple, one after the other, each by its own rule."""
+    flats = {key: _flat(part, f"{said} with {key!r}") for key, part in parts.items()}
+    writes, at = [], 0
+    for key, flat in flats.items():
+        writes.append((key, slice(at, at + flat.size), flat.write))
+        at += flat.size
+
+    def write(obs: Any, row: np.ndarray) -> None:
+        if not isinstance(obs, kind) or len(obs) != len(writes):
+            told = f"the keys {list(obs)}" if isinstance(obs, Mapping) else type(obs).__name__
+            raise Fault(
+                f"returned {said} of {told}",
+                f"its observation_space says {list(parts)}: make the two agree",
+            )
+        for key, place, write_part in writes:
+            if kind is Mapping and key not in obs:
+                raise Fault(
+                    f"returned {said} without {key!r}",
+                    f"its observation_space says {list(parts)}: make the two agree",
+                )
+            write_part(obs[key], row[place])
+
+    small = all(flat.dtype == "uint8" for flat in flats.values())
+    low, high = (
+        np.concatenate([np.zeros(0), *(flat[k] for flat in flats.values())]) for k in (2, 3)
+    )
+    return _Flat(at, "uint8" if small and flats else "float32", low, high, write)
+
+
+def _padded(flat: _Flat, size: int) -> list[Any]:
+    pad = (0, size - flat.size)
+    return flat._replace(low=np.pad(flat.low, pad), high=np.pad(flat.high, pad)).bounds
+
+
+def _choice(space: gymnasium.Space) -> dict[str, int] | None:
+    """A Discrete as JSON; None for what is none."""
+    if not isinstance(space, gymnasium.spaces.Discrete):
+        return None
+    return {"n": int(space.n), "start": int(space.start)}
+
+
+def _described(space: gymnasium.Space) -> dict[str, Any]:
+    """An action space as JSON."""
+    if not isinstance(space, gymnasium.spaces.Box):
+        return _choice(space) or {}
+    low, high = (np.float64(bound).ravel().tolist() for bound in (space.low, space.high))
+    return {"low": low, "high": high, "shape": list(space.shape), "dtype": str(space.dtype)}
 
 
 def _actions(space: gymnasium.Space) -> tuple[int, Callable[[np.ndarray], np.ndarray]]:
@@ -309,9 +592,21 @@ def _count(result: Any, n: int, where: str, parts: str) -> None:
 
 
 def _number(reward: Any) -> float:
-    if np.shape(reward) != ():
+    """A real number of whatever type, no string among them."""
+    told = np.asarray(reward)
+    if told.shape != () or told.dtype.kind not in "fuib":
         raise Fault(f"returned the reward {reward!r}", "return one number")
     return reward
+
+
+def _flag(name: str, said: Any) -> bool:
+    """A truth value, as Python or NumPy have it, or 0 or 1; also in an array of one."""
+    if isinstance(said, (bool, np.bool_)):
+        return bool(said)
+    told = np.asarray(said)
+    if told.size != 1 or told.dtype.kind not in "biu" or told.flat[0] not in (0, 1):
+        raise Fault(f"returned {said!r} for {name}", "return True or False")
+    return bool(told.flat[0])
 
 
 APIS: dict[str, type[Single] | type[Team]] = {"gymnasium": Single, "pettingzoo": Team}

@@ -1,5 +1,8 @@
 """Does an environment keep the contract? For those who bring their own."""
 
+import dataclasses
+import time
+import warnings
 from collections.abc import Callable
 
 import equinox as eqx
@@ -14,32 +17,46 @@ from .host import AbstractCopies, AbstractHostEnvironment, HostStep, failure_of
 
 KEYS = 16  # episodes and sequences that are looked at
 HOST_STEPS = 2000  # the most that is played of one episode outside JAX
+HOST_SECONDS = 20.0  # the most that all of it may take, but for the last step
 
 
 def check_environment(env: AbstractEnvironment | AbstractHostEnvironment) -> list[str]:
     """What is wrong with an environment or sequence task, each with its fix; empty if nothing.
+    What is accepted, but should be known, is warned of (`UserWarning`).
 
     Plays 16 episodes of random actions, at most `2 * max_steps` steps each; of a task outside
-    JAX (`Gymnasium("Hopper-v5")`) two episodes, each of them twice. Later checks need
-    what earlier ones established, so mend what is listed and check again. What a JAX environment
-    itself raises, or JAX about its code, is not caught: it says more than a line here could.
+    JAX (`Gymnasium("Hopper-v5")`) two episodes, each of them twice, for at most about 20 seconds.
+    Later checks need what earlier ones established, so mend what is listed and check again. What a
+    JAX environment itself raises, or JAX about its code, is not caught: it says more than a line
+    here could.
     """
+    problems, remarks = examine(env)
+    known = env.warnings if isinstance(env, AbstractHostEnvironment) and not problems else ()
+    for remark in remarks:
+        if remark not in known:  # of those it was warned when the task was opened
+            warnings.warn(remark, stacklevel=2)
+    return problems
+
+
+def examine(env: AbstractEnvironment | AbstractHostEnvironment) -> tuple[list[str], list[str]]:
+    """What is wrong, as of `check_environment`, and what is accepted but should be known."""
     if isinstance(env, AbstractHostEnvironment):
         return _check_host(env)
     if not isinstance(env, AbstractEnvironment):
-        return [
+        told = (
             f"{type(env).__name__} is not an environment of ours: derive it from "
             "credo.environments.base.AbstractEnvironment, or AbstractSequenceTask for a "
             "labelled sequence; name a Gymnasium environment as Gymnasium(id)"
-        ]
+        )
+        return [told], []
     stages: list[Callable[..., list[str]]] = [_spec, _reset_and_step, _repeatable, _episodes]
     if isinstance(env, AbstractSequenceTask):
         stages[1:1] = [_sequence, _sequences, _sequence_reward]
     for stage in stages:
         problems = stage(env)
         if problems:
-            return list(dict.fromkeys(problems))
-    return []
+            return list(dict.fromkeys(problems)), []
+    return [], []
 
 
 def _spec(env: AbstractEnvironment | AbstractHostEnvironment) -> list[str]:
@@ -97,6 +114,10 @@ def _time_step(env: AbstractEnvironment, where: str, time_step: TimeStep) -> lis
         if not team:
             problems.append(f"{where}: active is for teams: leave it None, or set agents")
         problems += _array(f"{where}: active", time_step.active, team, np.bool_)
+    if time_step.gone is not None:
+        if not team:
+            problems.append(f"{where}: gone is for teams: leave it None, or set agents")
+        problems += _array(f"{where}: gone", time_step.gone, team, np.bool_)
     return problems
 
 
@@ -312,66 +333,121 @@ def _sequence_reward(task: AbstractSequenceTask) -> list[str]:
     return problems
 
 
-def _check_host(env: AbstractHostEnvironment) -> list[str]:
+def _check_host(env: AbstractHostEnvironment) -> tuple[list[str], list[str]]:
     """Two copies play two seeds, then the same with the seeds exchanged."""
     failure = failure_of(lambda: env.copies(2))
     problems = [str(failure)] if failure else _spec(env)
     if problems:
-        return problems
-    copies, problems, episodes = env.copies(2), [], []
+        return problems, []
+    turns = env.turns(np.ones(2, bool))
+    look = _Look(env, env.copies(2), HOST_SECONDS / (2 * len(turns)))
+    episodes: list[list[list[bytes]]] = []
 
     def play() -> None:
         for seeds in ([1, 2], [2, 1]):
-            episodes.append(_play_host(env, copies, np.array(seeds, np.uint32), problems))
+            seen: list[list[bytes]] = [[], []]
+            for turn in turns:
+                look.play(np.array(seeds, np.uint32), turn, seen)
+            episodes.append(seen)
 
     failure = failure_of(play)
     if failure:
-        problems.append(str(failure))
-    if problems:
-        return list(dict.fromkeys(problems))
-    (a, b), (c, d) = episodes
-    if a != d or b != c:
-        problems.append(
-            "the same seed gave two different episodes: draw everything from self.np_random, which "
-            "reset(seed=seed) seeds (a gymnasium.Env does by super().reset(seed=seed)), and let "
-            "reset set all state"
-        )
-    return problems
+        look.problems.append(str(failure))
+    if not look.problems:
+        (a, b), (c, d) = episodes
+        if not (_agree(a, d) and _agree(b, c)):
+            look.problems.append(
+                "the same seed gave two different episodes: draw everything from self.np_random, "
+                "which reset(seed=seed) seeds (a gymnasium.Env does by super().reset(seed=seed)), "
+                "and let reset set all state"
+            )
+    if look.late:
+        told = f"stopped after {HOST_SECONDS:g} s: {look.steps:,} steps were looked at"
+        look.remarks.append(told)
+    remarks = [*env.warnings, *look.remarks]
+    return list(dict.fromkeys(look.problems)), list(dict.fromkeys(remarks))
 
 
-def _play_host(
-    env: AbstractHostEnvironment, copies: AbstractCopies, seeds: np.ndarray, problems: list[str]
-) -> list[bytes]:
-    """One episode in every copy, all with the same random actions: all that was seen.
+def _agree(a: list[bytes], b: list[bytes]) -> bool:
+    """As far as both were played."""
+    return all(x == y for x, y in zip(a, b, strict=False))
 
-    What is wrong is added to `problems`; at the first wrong step it stops.
-    """
-    random, active = np.random.default_rng(0), np.ones(copies.n, bool)
-    obs_size, action_size, *team = env.sizes
-    obs = copies.reset(seeds, active)
-    problems += _numbers("reset: obs", obs, (copies.n, *team, obs_size), np.float32)
-    seen = [obs[i].tobytes() for i in range(copies.n)] if not problems else []
-    for _ in range(min(env.max_steps, HOST_STEPS)):
-        if problems or not active.any():
-            return seen
-        action = np.clip(random.uniform(-1.5, 1.5, (1, *team, action_size)), -1.0, 1.0)
-        step = copies.step(np.repeat(np.float32(action), copies.n, axis=0), active)
-        problems += _host_step(env, step, active)
-        for i in np.flatnonzero(active) if not problems else ():
-            rewards = [step.rewards[name][i].tobytes() for name in env.signals]
-            seen[i] += b"".join([step.obs[i].tobytes(), *rewards])
-        active = active & ~(step.terminated | step.truncated)
-    if active.any() and env.max_steps <= HOST_STEPS:
-        problems.append(
-            f"an episode had not ended after max_steps, {env.max_steps}: set truncated when the "
-            "clock runs out"
-        )
-    return seen
+
+@dataclasses.dataclass
+class _Look:
+    """What is seen of two copies. Play stops at the first wrong step."""
+
+    env: AbstractHostEnvironment
+    copies: AbstractCopies
+    seconds: float  # of one `play`
+    problems: list[str] = dataclasses.field(default_factory=list)
+    remarks: list[str] = dataclasses.field(default_factory=list)
+    steps: int = 0
+    late: bool = False
+
+    def play(self, seeds: np.ndarray, active: np.ndarray, seen: list[list[bytes]]) -> None:
+        """One episode in every active copy, all with the same random actions; all that was seen is
+        added to `seen`, step by step."""
+        random, until = np.random.default_rng(0), time.monotonic() + self.seconds
+        obs_size, action_size, *team = self.env.sizes
+        n, most, dtype = len(active), self.env.max_steps, np.dtype(self.env.obs_dtype).type
+        obs = self.copies.reset(seeds, active)
+        self.problems += _numbers("reset: obs", obs, (n, *team, obs_size), dtype)
+        self._failures(self.copies.failed)
+        for i in np.flatnonzero(active) if not self.problems else ():
+            seen[i].append(obs[i].tobytes())
+            self._range("reset", obs[i])
+        for t in range(min(most, HOST_STEPS)):
+            if self.problems or not active.any():
+                return
+            if time.monotonic() > until:
+                self.late = True
+                return
+            action = np.clip(random.uniform(-1.5, 1.5, (1, *team, action_size)), -1.0, 1.0)
+            step = self.copies.step(np.repeat(np.float32(action), n, axis=0), active)
+            self._look(step, active, t + 1, seen)
+            active = active & ~(step.terminated | step.truncated)
+        if active.any() and most <= HOST_STEPS:
+            self.problems.append(
+                f"an episode had not ended after max_steps, {most}: set truncated when the clock "
+                "runs out"
+            )
+
+    def _look(self, step: HostStep, active: np.ndarray, t: int, seen: list[list[bytes]]) -> None:
+        self._failures(step.failed)
+        self.problems += _host_step(self.env, step, active)
+        self.steps += int(active.sum())
+        for i in np.flatnonzero(active) if not self.problems else ():
+            rewards = [step.rewards[name][i].tobytes() for name in self.env.signals]
+            seen[i].append(b"".join([step.obs[i].tobytes(), *rewards]))
+            self._range(f"step {t}", step.obs[i])
+
+    def _failures(self, failed: np.ndarray | None) -> None:
+        """None is tolerated here."""
+        for i in np.flatnonzero(failed) if failed is not None else ():
+            self.problems.append(self.copies.failure_text(int(i)))
+
+    def _range(self, when: str, obs: np.ndarray) -> None:
+        """An observation `[*agents, obs]` may leave its space, and that is said once. An agent that
+        is away observes 0."""
+        low, high = self.env.obs_range
+        out = (obs < low) | (obs > high)
+        if out.any() and not self.remarks:
+            out = out & (obs != 0).any(axis=-1, keepdims=True)
+        if out.any() and not self.remarks:
+            place = tuple(np.argwhere(out)[0].tolist())
+            least, most = (np.broadcast_to(x, obs.shape)[place] for x in (low, high))
+            self.remarks.append(
+                f"an observation leaves its observation_space at {when}: entry {place[-1]} is "
+                f"{obs[place]:g}, and its bounds are {least:g} and {most:g}. Training takes it as "
+                "it is: widen the space, or clip"
+            )
 
 
 def _host_step(env: AbstractHostEnvironment, step: HostStep, active: np.ndarray) -> list[str]:
     n, (obs_size, _, *team) = len(active), env.sizes
-    problems = _numbers("step: obs", step.obs, (n, *team, obs_size), np.float32, active)
+    dtype = np.dtype(env.obs_dtype).type
+    problems = _numbers("step: obs", step.obs, (n, *team, obs_size), dtype, active)
     if set(step.rewards) != set(env.signals):
         problems.append(
             f"step: rewards are {sorted(step.rewards)} but signals names {sorted(env.signals)}: "
@@ -384,6 +460,8 @@ def _host_step(env: AbstractHostEnvironment, step: HostStep, active: np.ndarray)
         problems += _numbers(f"step: {name}", getattr(step, name), (n,), np.bool_)
     if team:
         problems += _numbers("step: active", step.active, (n, *team), np.bool_)
+        if step.gone is not None:
+            problems += _numbers("step: gone", step.gone, (n, *team), np.bool_)
     return problems
 
 
@@ -399,8 +477,13 @@ def _numbers(
     if not isinstance(x, np.ndarray) or x.shape != shape or not np.issubdtype(x.dtype, dtype):
         given = f"{x.dtype}{list(x.shape)}" if isinstance(x, np.ndarray) else type(x).__name__
         return [f"{what} is {given}: return a NumPy array of {name} and shape {list(shape)}"]
-    if not np.isfinite(x if active is None else x[active]).all():
-        return [f"{what} has NaN or inf: guard the division, root or logarithm it is from"]
+    shown = x if active is None else x[active]
+    with np.errstate(over="ignore"):
+        if not np.isfinite(shown.astype(np.float32)).all():
+            return [
+                f"{what} has NaN or inf, or is beyond ±3.4e38: guard the division, root or "
+                "logarithm it is from"
+            ]
     return []
 
 

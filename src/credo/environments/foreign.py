@@ -4,18 +4,23 @@
 """
 
 import atexit
+import collections
 import os
+import threading
+import warnings
+import weakref
 from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
 
-from . import worker
+from . import names, processes, worker
 from .host import (
     AbstractCopies,
     AbstractHostEnvironment,
     EnvironmentFailure,
     HostStep,
+    InTurn,
     UnfitEnvironment,
 )
 
@@ -39,7 +44,13 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
     api: ClassVar[str]  # whose interface it has: a key of adapters.APIS
     kwargs: tuple[tuple[str, Any], ...] = eqx.field(static=True, default=(), converter=_pairs)
     max_episode_steps: int | None = eqx.field(static=True, default=None)  # None: its own
-    timeout: float = eqx.field(static=True, default=60.0)  # seconds that one call may take
+    timeout: float = eqx.field(static=True, default=60.0)
+    """Seconds that one copy may take for a reset or a step."""
+    tolerated: float = eqx.field(static=True, default=0.1)
+    """The share of the last 100 episodes that may fail, each with a return of NaN; if more do, and
+    at least 3, `EnvironmentFailure` is raised. 0: the first one raises it."""
+    at_once: int | None = eqx.field(static=True, default=None)
+    """Most copies that are open at the same time; None: as many as play together."""
     in_process: bool = eqx.field(static=True, default=False)
     """No worker. For debugging and for classes of a prompt: here nothing stops an environment
     that hangs, and one that crashes takes this process with it."""
@@ -54,6 +65,10 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
         limit = self.max_episode_steps
         if limit is not None and limit < 1:
             raise ValueError(f"max_episode_steps is {limit}: it must be at least 1, or None")
+        if not 0 <= self.tolerated <= 1:
+            raise ValueError(f"tolerated is {self.tolerated}: it must be a share, from 0 to 1")
+        if self.at_once is not None and self.at_once < 1:
+            raise ValueError(f"at_once is {self.at_once}: it must be at least 1, or None")
         if not self.timeout > 0:
             raise ValueError(f"timeout is {self.timeout}: it must be more than 0 seconds")
 
@@ -70,94 +85,234 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
         return self._sizes()["max_steps"]
 
     @property
+    def obs_dtype(self) -> str:
+        return self._sizes()["obs_dtype"]
+
+    @property
     def discrete(self) -> bool:
         return bool(self._sizes()["discrete"])
 
-    def copies(self, n: int) -> "ForeignCopies":
+    def spec(self) -> dict[str, Any]:
+        """What a worker must know to open it, as JSON has it."""
+        return {
+            "api": self.api,
+            "id": self.id,
+            "kwargs": dict(self.kwargs),
+            "max_episode_steps": self.max_episode_steps,
+            "registered": names.registered(self.id) if self.api == "gymnasium" else None,
+            **self._paid(),
+        }
+
+    def _paid(self) -> dict[str, Any]:
+        """Of a team: pairs of a reward and of what pays it, and which rewards all share."""
+        return {"rewards": [], "shared": []}
+
+    @property
+    def foreign_code(self) -> str | None:
+        """Whose code opening this would import, by name; None for what Gymnasium, PettingZoo, MPE2
+        and Credo themselves have."""
+        makers = (at for _, at in self._paid()["rewards"])
+        return names.foreign_code(self.api, self.id, dict(self.kwargs)) or next(makers, None)
+
+    @property
+    def here(self) -> bool:
+        """Whether it is played in this process: asked for, or because no other can import it."""
+        return self.in_process or names.here_alone(self.id)
+
+    def task_record(self) -> dict[str, Any]:
+        """What a run records of its task, so that a policy acts in the task's units without it."""
+        return {name: self._sizes()[name] for name in RECORDED}
+
+    @property
+    def obs_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the largest of each observed number, `[*agents, obs]`, as the observation
+        space says; no one looks whether they are kept but `check_environment`."""
+        said, size = self._sizes()["obs_range"], self.obs_size
+        if self.agents is None:
+            low, high = (np.broadcast_to(np.float32(x), (size,)) for x in said)
+        else:
+            low, high = (
+                np.stack([np.broadcast_to(np.float32(x), (size,)) for x in column])
+                for column in zip(*said, strict=True)
+            )
+        return low, high
+
+    def copies(self, n: int) -> "ForeignCopies | InTurn":
+        """`n` copies, kept open for the life of this thread: asking again returns the same. With
+        `at_once` they share that many and play in turn."""
         if n < 1:
             raise ValueError(f"copies({n}): ask for at least 1")
-        key = (self, n)
-        if key in _OPEN and not _OPEN[key].usable:
-            _OPEN.pop(key).close()
-        if key not in _OPEN:
-            _OPEN[key] = ForeignCopies(self, n)
-        return _OPEN[key]
+        some, kept = self.at_once or n, _OPEN.copies
+        if (self, some) in kept and not kept[self, some].usable:
+            kept.pop((self, some)).close()
+        if (self, some) not in kept:
+            kept[self, some] = ForeignCopies(self, some)
+            self._warn()
+        return kept[self, some] if self.at_once is None else InTurn(kept[self, some], n)
 
     def _sizes(self) -> dict[str, Any]:
         """What only the environment itself can tell: it is opened for this, once."""
         if self not in _SIZES:
             ForeignCopies(self, 1).close()
+            self._warn()
         return _SIZES[self]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What its users should know, although it can be played."""
+        return tuple(self._sizes()["warnings"])
+
+    def _warn(self) -> None:
+        if self not in _WARNED:
+            _WARNED.add(self)
+            for told in self.warnings:
+                warnings.warn(f"{self.id}: {told}", stacklevel=4)
 
 
 class ForeignCopies(AbstractCopies):
     """`n` copies in one worker. Rewards are float64, as Gymnasium has them.
 
-    A team's `local` rewards are its agents' own, `global` is their mean.
+    An episode in which the environment raises, hangs, ends its process or returns what it must not
+    has failed, and its copy is opened anew. If the worker is lost, so are the episodes of all its
+    copies. `tolerated` of the task says when that is too much.
     """
 
     def __init__(self, env: AbstractForeignEnvironment, n: int):
-        self.n, self._id = n, env.id
-        spec = {
-            "api": env.api,
-            "id": env.id,
-            "kwargs": dict(env.kwargs),
-            "max_episode_steps": env.max_episode_steps,
-        }
+        self.n, self._env, self._closed = n, env, False
         self._seeds, self._steps = np.zeros(n, np.uint32), np.zeros(n, np.int64)
+        self._running = np.zeros(n, bool)  # in an episode
+        self._stranded = np.zeros(n, bool)  # in one that was lost with the worker
+        self._broken = np.zeros(n, bool)  # whose episode has failed
+        self._recent: collections.deque[str] = collections.deque(maxlen=100)  # why it failed, or ""
+        self._whys: dict[int, str] = {}
         self._backend: worker.Environments | worker.Process | None = None
-        try:
-            if env.in_process:
-                self._backend = worker.Environments(spec, n)
-            else:
-                self._backend = worker.Process(spec, n, env.timeout)
-        except worker.Fault as fault:
-            raise UnfitEnvironment(f"{env.id} {fault.what}: {fault.fix}") from fault
-        _SIZES[env] = sizes = self._backend.sizes()
+        _SIZES[env] = sizes = self._opened().sizes()
         team = () if sizes["agents"] is None else (sizes["agents"],)
         self._actions = (n, *team, sizes["action_size"])
+        _ALL.add(self)
+
+    def _opened(self) -> worker.Environments | worker.Process:
+        if self._backend is None:
+            env, spec = self._env, self._env.spec()
+            processes.allow()
+            try:
+                if env.here:
+                    self._backend = worker.Environments(spec, self.n)
+                else:
+                    self._backend = worker.Process(spec, self.n, env.timeout)
+            except worker.Fault as fault:
+                raise UnfitEnvironment(f"{env.id} {fault.what}: {fault.fix}") from fault
+            self._finalizer = weakref.finalize(self, self._backend.close, worker.GRACE)
+        return self._backend
 
     @property
     def usable(self) -> bool:
-        return self._backend is not None and self._backend.usable
+        return not self._closed and (self._backend is None or self._backend.usable)
+
+    @property
+    def failures(self) -> int:
+        """How many of the last 100 episodes have failed."""
+        return sum(map(bool, self._recent))
+
+    def failure_text(self, i: int) -> str:
+        return self._whys.get(i, "unknown")
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
         seeds = _form(seeds, (self.n,), np.uint32)
         active = _form(active, (self.n,), np.bool_)
         np.copyto(self._seeds, seeds, where=active)
-        self._steps[active] = 0
-        return self._call("reset", seeds, active).obs
+        self._steps[active], self._stranded[active], self._broken[active] = 0, False, False
+        self._running |= active
+        frame, self.failed = self._call("reset", seeds, active)
+        return frame.obs
 
     def step(self, actions: np.ndarray, active: np.ndarray) -> HostStep:
         actions = _form(actions, self._actions, np.float32)
         active = _form(active, (self.n,), np.bool_)
+        over = active & self._broken
+        if over.any():  # whoever asked takes no notice of `failed`
+            raise EnvironmentFailure(self.failure_text(int(over.argmax())))
         self._steps += active
-        frame = self._call("step", actions, active)
+        frame, failed = self._call("step", actions, active)
+        ended = frame.terminated | frame.truncated
+        if ended.any():
+            self._running &= ~ended
+            self._recent.extend([""] * int(ended.sum()))
+        acting = None if frame.active is None else frame.active & ~ended[:, None]
         ends = (frame.terminated, frame.truncated)
-        if frame.active is None:
-            return HostStep(frame.obs, {"reward": frame.rewards}, *ends)
-        rewards = {"global": frame.rewards.mean(axis=1), "local": frame.rewards}
-        return HostStep(frame.obs, rewards, *ends, frame.active & ~(ends[0] | ends[1])[:, None])
+        return HostStep(frame.obs, frame.rewards, *ends, acting, failed, frame.gone)
 
-    def _call(self, name: str, *arguments: np.ndarray) -> worker.Frame:
-        if self._backend is None:
+    def _call(self, name: str, numbers: np.ndarray, active: np.ndarray):
+        """What the worker says, and which copies failed."""
+        if self._closed:
             raise EnvironmentFailure(
-                f"{self._id}: these copies are closed: ask for copies(n) again"
+                f"{self._env.id}: these copies are closed: ask for copies(n) again"
             )
-        try:
-            return getattr(self._backend, name)(*arguments)
-        except worker.Fault as fault:
-            copy = self._backend.current[0]
+        failed = active & self._stranded
+        while True:
+            backend = self._opened()
+            asked = active & ~failed
+            try:
+                frame = getattr(backend, name)(numbers, asked)
+                faults = frame.faults
+            except worker.Lost as fault:
+                frame, faults = None, {int(backend.current[0]): fault}
+            except worker.Fault as fault:
+                self.close(grace=0.0)
+                copy = backend.current[0]
+                raise EnvironmentFailure(self._told(name, copy, fault)) from fault
+            if faults:
+                self._failed(name, asked, faults)
+            if frame is not None:
+                break
+            failed |= self._lost(name, asked, backend)
+        if failed.any() or faults:
+            failed |= frame.failed
+            self._running &= ~failed
+            self._stranded &= ~failed
+            self._broken |= failed
+        return frame, failed
+
+    def _lost(self, name: str, asked: np.ndarray, backend: Any) -> np.ndarray:
+        """The worker is gone: who failed with it. Those who were to be reset can be asked again;
+        the others hear of it when it is their turn."""
+        culprit = np.arange(self.n) == backend.current[0]
+        gone = asked & culprit if name == "reset" else asked
+        self._stranded |= self._running & ~asked
+        self._finalizer.detach()
+        self._backend = None
+        backend.close(0.0)
+        for i in np.flatnonzero((gone | self._stranded) & ~culprit).tolist():
+            copy = backend.current[0]
+            self._whys[i] = f"was lost with the worker of copy {copy}: {self._whys[copy]}"
+        return gone
+
+    def _failed(self, name: str, asked: np.ndarray, faults: dict[int, worker.Fault]) -> None:
+        """Count, and say when it is too much."""
+        for copy, fault in faults.items():
+            self._whys[copy] = self._told(name, copy, fault)
+            self._recent.append(self._whys[copy])
+        playing = int(self._running.sum()) - len(faults)  # as good as any until they fail
+        failures, recent = self.failures, min(len(self._recent) + playing, 100)
+        most = self._env.tolerated
+        if failures > most * recent and (failures >= 3 or most == 0):
+            first = next(filter(None, self._recent))
             self.close(grace=0.0)
-            where = f"step {self._steps[copy]}" if name == "step" else "the reset"
-            raise EnvironmentFailure(
-                f"{self._id} {fault.what}, in copy {copy} at {where} of the episode with seed "
-                f"{self._seeds[copy]}: {fault.fix}"
-            ) from fault
+            count = f" ({failures} of {recent} episodes failed)" if failures > 1 else ""
+            raise EnvironmentFailure(f"{first}{count}") from next(iter(faults.values()))
+
+    def _told(self, name: str, copy: int, fault: worker.Fault) -> str:
+        where = f"step {self._steps[copy]}" if name == "step" else "the reset"
+        return (
+            f"{self._env.id} {fault.what}, in copy {copy} at {where} of the episode with seed "
+            f"{self._seeds[copy]}: {fault.fix}"
+        )
 
     def close(self, grace: float = worker.GRACE) -> None:
         """End the worker; asking the environment for copies again starts another."""
+        self._closed = True
         if self._backend is not None:
+            self._finalizer.detach()
             self._backend.close(grace)
         self._backend = None
 
@@ -169,15 +324,33 @@ def _form(x: np.ndarray, shape: tuple[int, ...], dtype: type) -> np.ndarray:
     return x
 
 
-_OPEN: dict[tuple[AbstractForeignEnvironment, int], ForeignCopies] = {}
+RECORDED = ("obs_size", "action_size", "agents", "discrete", "actions", "observations")
+_WARNED: set[AbstractForeignEnvironment] = set()
+
+
+class _Kept(threading.local):
+    """The open copies of this thread: they are closed when it ends."""
+
+    def __init__(self):
+        self.copies: dict[tuple[AbstractForeignEnvironment, int], ForeignCopies] = {}
+
+
+_OPEN = _Kept()
+_ALL: weakref.WeakSet[ForeignCopies] = weakref.WeakSet()
 _SIZES: dict[AbstractForeignEnvironment, dict[str, Any]] = {}
 
 
 def close_all() -> None:
     """End every worker of this process."""
-    while _OPEN:
-        _OPEN.popitem()[1].close()
+    _OPEN.copies.clear()
+    for copies in list(_ALL):
+        copies.close()
+
+
+def _after_fork() -> None:
+    """The pipes are the parent's."""
+    _OPEN.copies.clear()
 
 
 atexit.register(close_all)
-os.register_at_fork(after_in_child=_OPEN.clear)  # the pipes are the parent's
+os.register_at_fork(after_in_child=_after_fork)

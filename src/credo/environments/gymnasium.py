@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from . import names
 from .base import AbstractEnvironment
 from .foreign import AbstractForeignEnvironment, close_all
 
@@ -82,10 +83,8 @@ class GymnasiumEnvironment(gymnasium.Env):
 
 def make(task: str, signal: str | None = None, **fields: Any) -> GymnasiumEnvironment:
     """The task `package.module:Class` with these fields, as a Gymnasium environment."""
-    import importlib
-
-    module, _, name = task.partition(":")
-    return GymnasiumEnvironment(getattr(importlib.import_module(module), name)(**fields), signal)
+    cls = names.resolve(task, AbstractEnvironment)
+    return GymnasiumEnvironment(cls(**fields), signal)
 
 
 for _name, _task in TASKS.items():
@@ -96,13 +95,19 @@ for _name, _task in TASKS.items():
 class Gymnasium(AbstractForeignEnvironment):
     """A Gymnasium environment whose copies are stepped in a worker process.
 
-    Observations: a Box of any shape is flattened, a Discrete is one-hot, a Dict or Tuple is its
-    parts one after the other. Actions: a Box is scaled so that -1 is its low and 1 its high; of
-    a Discrete the largest entry is taken. `kwargs` may be given as a dict. Whatever
-    goes wrong raises `EnvironmentFailure`, and the next `copies` start a new worker.
+    Observations: a Box of any shape is flattened and cast to float32 (one of uint8 stays uint8),
+    whether or not the numbers lie within its bounds, which `check_environment` says; a Discrete is
+    one-hot, a Dict or Tuple is its parts one after the other. Actions: a Box is scaled so that -1
+    is its low and 1 its high; of a Discrete the largest entry is taken, or the largest that
+    `action_mask` allows, where a Dict observation or `info` has one. Without any time limit an
+    episode is truncated after 1,000 steps. `kwargs` may be given as a dict. Whatever goes wrong
+    raises `EnvironmentFailure`, and the next `copies` start a new worker.
     """
 
-    id: str = eqx.field(static=True)
-    """"Hopper-v5", "package.module:Class", or "package:Name-v0" of a package that registers it."""
+    id: str = eqx.field(static=True, converter=names.name_of)
+    """"Hopper-v5", "package.module:name" of a class or of a function that makes one, the class or
+    function itself, or "package:Name-v0" of a package that registers it. An id that this process
+    registered is registered in the worker too. What no other process can import, such as a class
+    of a notebook, is played in this process, and its runs can be resumed there alone."""
     api: ClassVar[str] = "gymnasium"
     signals: ClassVar[tuple[str, ...]] = ("reward",)

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
+import jax
 import numpy as np
-from jaxtyping import Bool, Float, UInt32
+from jaxtyping import Bool, Float, Shaped, UInt32
 
 
 class EnvironmentFailure(RuntimeError):
@@ -38,25 +39,39 @@ class HostStep:
     For a team, observations and private rewards have an axis of agents, and `active` says who acts
     at the next step. An agent that leaves has its last reward and observation in that very step;
     while it is away both are 0.
+
+    In a copy that `failed` the episode broke in this step: it is over, and worth nothing.
     """
 
-    obs: Float[np.ndarray, "n *agents obs"]
+    obs: Shaped[np.ndarray, "n *agents obs"]  # float32, or uint8 if the task's obs_dtype says so
     rewards: dict[str, Float[np.ndarray, "n *agents"]]
     terminated: Bool[np.ndarray, " n"]  # the task ended: do not bootstrap
     truncated: Bool[np.ndarray, " n"]  # the clock ran out: do bootstrap
     active: Bool[np.ndarray, "n agents"] | None = None
+    failed: Bool[np.ndarray, " n"] | None = None  # None: no copy did
+    gone: Bool[np.ndarray, "n agents"] | None = None  # this agent itself terminated in this step
+
+    @property
+    def ended(self) -> Bool[np.ndarray, "n *agents"]:
+        """For whom the task ended: do not bootstrap. Of a team by agent."""
+        if self.active is None:
+            return self.terminated
+        ended = np.repeat(self.terminated[:, None], self.active.shape[1], axis=1)
+        return ended if self.gone is None else ended | self.gone
 
 
 class AbstractCopies(abc.ABC):
     """`n` copies of one environment, stepped together."""
 
     n: int
+    failed: Bool[np.ndarray, " n"] | None = None
+    """Which active copies the last `reset` found broken: they have no episode. None: none."""
 
     @abc.abstractmethod
     def reset(self, seeds: UInt32[np.ndarray, " n"], active: Bool[np.ndarray, " n"]) -> np.ndarray:
         """A fresh episode in every active copy; its seed decides all that is random in it.
 
-        **Returns:** observations `[n, obs]`, of a team `[n, agents, obs]`, float32.
+        **Returns:** observations `[n, obs]`, of a team `[n, agents, obs]`, of the task's obs_dtype.
         """
 
     @abc.abstractmethod
@@ -64,6 +79,65 @@ class AbstractCopies(abc.ABC):
         self, actions: Float[np.ndarray, "n *agents act"], active: Bool[np.ndarray, " n"]
     ) -> HostStep:
         """One step of every active copy; the others cost nothing. Actions lie in [-1, 1]."""
+
+    def failure_text(self, i: int) -> str:
+        """Why the last episode of copy `i` that failed did."""
+        return "unknown"
+
+
+class InTurn(AbstractCopies):
+    """`n` copies of which no more play at the same time than `inner` has."""
+
+    def __init__(self, inner: AbstractCopies, n: int):
+        self.inner, self.n = inner, n
+        self._seats = np.zeros(0, np.int64)  # who plays
+        self._whys: dict[int, str] = {}
+
+    def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
+        """As for all copies, but whose episode is not over and who is not active loses it."""
+        self._seats = lanes = np.flatnonzero(active)
+        if lanes.size > self.inner.n:
+            raise ValueError(
+                f"{lanes.size} episodes were to begin at once: at_once allows {self.inner.n}, so "
+                "play them in turn"
+            )
+        some = self._some(np.asarray(seeds, np.uint32))
+        obs = self.inner.reset(some, np.arange(self.inner.n) < lanes.size)
+        self.failed = None if self.inner.failed is None else self._all(self.inner.failed)
+        self._keep(self.failed)
+        return self._all(obs)
+
+    def step(self, actions: np.ndarray, active: np.ndarray) -> HostStep:
+        if not np.isin(np.flatnonzero(active), self._seats).all():
+            raise ValueError("a step was asked of a copy that is not playing: reset it first")
+        now = self.inner.step(self._some(actions), self._some(active))
+        said = {name: getattr(now, name) for name in _PARTS}
+        said = {name: x if x is None else self._all(x) for name, x in said.items()}
+        rewards = {name: self._all(reward) for name, reward in now.rewards.items()}
+        self._keep(said["failed"])
+        return HostStep(rewards=rewards, **said)
+
+    def failure_text(self, i: int) -> str:
+        return self._whys.get(i, "unknown")
+
+    def _some(self, x: np.ndarray) -> np.ndarray:
+        """What is said to those who play, in the order of their seats."""
+        some = np.zeros((self.inner.n, *np.shape(x)[1:]), np.asarray(x).dtype)
+        some[: self._seats.size] = np.asarray(x)[self._seats]
+        return some
+
+    def _all(self, x: np.ndarray) -> np.ndarray:
+        rows = np.zeros((self.n, *x.shape[1:]), x.dtype)
+        rows[self._seats] = x[: self._seats.size]
+        return rows
+
+    def _keep(self, failed: np.ndarray | None) -> None:
+        for seat, lane in enumerate(self._seats.tolist()):
+            if failed is not None and failed[lane]:
+                self._whys[lane] = self.inner.failure_text(seat)
+
+
+_PARTS = ("obs", "terminated", "truncated", "active", "failed", "gone")
 
 
 class AbstractHostEnvironment(eqx.Module):
@@ -81,6 +155,22 @@ class AbstractHostEnvironment(eqx.Module):
         signals: eqx.AbstractVar[tuple[str, ...]]  # names of the rewards, as in a JAX task
     agents: ClassVar[int | None] = None
     discrete: ClassVar[bool] = False  # the largest of an action's entries is taken
+    obs_dtype: ClassVar[str] = "float32"  # or "uint8"
+    if TYPE_CHECKING:
+        obs_range: ClassVar[tuple[Any, Any]]
+    else:
+        obs_range = (-np.inf, np.inf)  # the least and the largest of the observed numbers
+    warnings: ClassVar[tuple[str, ...]] = ()  # what its users should know
+
+    @property
+    def at_once(self) -> int | None:
+        """Most copies that play at the same time; None: all. A field of those that can choose."""
+        return None
+
+    def turns(self, active: Bool[np.ndarray, " n"]) -> list[Bool[np.ndarray, " n"]]:
+        """Who of the active copies plays together, in order: all, or `at_once` at a time."""
+        turn = (np.cumsum(active) - 1) // (self.at_once or active.size)
+        return [active & (turn == k) for k in range(max(turn.max(), 0) + 1)]
 
     @property
     def reported(self) -> str:
@@ -98,6 +188,92 @@ class AbstractHostEnvironment(eqx.Module):
         """Of each reward of one copy: () or, of one that is private to each agent, (agents,)."""
         return dict.fromkeys(self.signals, ())
 
+    def task_record(self) -> dict[str, Any]:
+        """What a run records of its task; `actions`: how the task itself takes an action, None
+        for numbers in [-1, 1] as they are."""
+        agents = {"agents": self.agents, "discrete": self.discrete}
+        sizes = {"obs_size": self.obs_size, "action_size": self.action_size}
+        return {**sizes, **agents, "actions": None, "observations": None}
+
     @abc.abstractmethod
     def copies(self, n: int) -> AbstractCopies:
         """`n` copies, kept open for the life of this process: asking again returns the same."""
+
+
+class Episodes:
+    """One episode of each of `n` copies, as it is played: its length, its returns by reward and,
+    if they are recorded, its transitions. Played in turn, each turn is `begin` and then `advance`
+    while it is `ongoing`.
+
+    An episode is lost, with a return of NaN and no transitions, if it failed or if its policy said
+    NaN or inf.
+    """
+
+    def __init__(self, env: AbstractHostEnvironment, n: int, record: bool):
+        self.ongoing = False
+        self.steps = np.zeros(n, np.int32)
+        self._env, self._copies, self._record = env, env.copies(n), record
+        self._lost = np.zeros(n, bool)
+        self._sums = {name: np.zeros((n, *shape)) for name, shape in env.reward_shapes.items()}
+        self._turns: list[tuple[np.ndarray, ...]] = []
+
+    def begin(self, seeds: UInt32[np.ndarray, " n"], turn: Bool[np.ndarray, " n"]) -> np.ndarray:
+        """Start the episodes of a turn: their first observations, `[n, ...]`."""
+        self._acting = None
+        if self._env.agents is not None:
+            self._acting = np.ones((turn.size, self._env.agents), bool)
+        self._obs = self._copies.reset(seeds, turn)
+        self._active = self._less(turn, self._copies.failed)
+        self._rows, self._valid, self._left = [], [], self._env.max_steps
+        self.ongoing = True
+        return self._obs
+
+    def advance(self, actions: Float[np.ndarray, "n *agents act"]) -> np.ndarray:
+        """One step of the turn: the next observations."""
+        nan, active = ~np.isfinite(actions), self._active
+        self._lost |= active & nan.reshape(active.size, -1).any(axis=1)
+        actions = np.where(nan, np.float32(0.0), actions)
+        now = self._copies.step(actions, active)
+        for name, reward in now.rewards.items():
+            lanes = active.reshape(-1, *[1] * (reward.ndim - 1))
+            self._sums[name] += np.where(lanes, reward, 0.0)
+        self.steps += active
+        if self._record:
+            ends = (now.ended, now.truncated, self._acting)
+            self._rows.append((self._obs, actions, now.rewards, now.obs, *ends))
+            self._valid.append(active)
+        active = self._less(active, now.failed)
+        self._active = active & ~(now.terminated | now.truncated)
+        self._obs, self._acting, self._left = now.obs, now.active, self._left - 1
+        self.ongoing = bool(self._left and self._active.any())
+        if self._record and not self.ongoing:
+            self._turns.append(self._kept())
+        return self._obs
+
+    def _less(self, active: np.ndarray, failed: np.ndarray | None) -> np.ndarray:
+        """Those whose episode goes on."""
+        if failed is None:
+            return active
+        self._lost |= active & failed
+        return active & ~failed
+
+    def _kept(self) -> tuple[Any, ...]:
+        """The rows of a turn, episode by episode, as learners see them."""
+        valid = np.stack(self._valid, axis=1) & ~self._lost[:, None]
+
+        def kept(*steps: np.ndarray) -> np.ndarray:
+            x = np.stack(steps, axis=1)[valid]
+            return x.astype(np.float32) if x.dtype == np.float64 else x
+
+        return jax.tree.map(kept, *self._rows)
+
+    def returns(self) -> dict[str, Float[np.ndarray, "n *agents"]]:
+        for total in self._sums.values():
+            total[self._lost] = np.nan
+        return self._sums
+
+    def rows(self) -> tuple[Any, ...]:
+        """The fields of a `Transition`, all episodes one behind the other."""
+        if len(self._turns) == 1:
+            return self._turns[0]
+        return jax.tree.map(lambda *turns: np.concatenate(turns), *self._turns)

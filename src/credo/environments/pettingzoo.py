@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from . import names
 from .base import AbstractEnvironment
 from .foreign import AbstractForeignEnvironment
 
@@ -27,6 +28,12 @@ if importlib.util.find_spec("pettingzoo") is None:
     raise ModuleNotFoundError('teams of others need PettingZoo: `pip install "credo[pettingzoo]"`')
 
 from pettingzoo import ParallelEnv
+
+
+def _makers(rewards: Any) -> Any:
+    """Functions by the rewards' names as pairs of names."""
+    pairs = rewards.items() if isinstance(rewards, dict) else rewards
+    return tuple((name, names.name_of(maker)) for name, maker in pairs)
 
 
 class PettingZoo(AbstractForeignEnvironment):
@@ -37,20 +44,46 @@ class PettingZoo(AbstractForeignEnvironment):
     largest of the team; each agent is given as much of it as its own Box holds, scaled so that -1
     is its low and 1 its high. Who is not there observes 0, earns 0, and its action is ignored.
 
-    Signals: `local` `[agents]`, what each agent earns; `global`, the mean over all rows.
-    `terminated`: every agent that took part has terminated; an episode that is over otherwise was
-    truncated. Learners take an agent that leaves before the others for one that goes on, and who is
-    not there at the start for one that is. The time limit is `max_episode_steps` or the
-    environment's own `max_cycles`, whichever is less. Whatever goes wrong raises
+    Rewards: `local` `[agents]`, what the environment pays each agent, and `global`, its mean over
+    all rows, unless the task names its own: in `info["rewards"]`, a dict of every agent that acted
+    (looked up in one step when the task is opened), or by `rewards`.
+
+    An agent's own termination ends its value; who leaves by truncation is bootstrapped from its
+    last observation. `terminated` of the episode: every agent that took part has terminated; an
+    episode that is over otherwise was truncated. Learners take who is not there at the start for
+    one that is. The time limit is `max_episode_steps` or the environment's own `max_cycles`,
+    whichever is less, or 1,000 steps if there is none. Whatever goes wrong raises
     `EnvironmentFailure`, and the next `copies` start a new worker.
     """
 
-    id: str = eqx.field(static=True)
+    id: str = eqx.field(static=True, converter=names.name_of)
     """"mpe2.simple_spread_v3" (a module with parallel_env), "package.module:name" of a function or
-    class that makes a ParallelEnv, or "sisl/multiwalker-v9" (an id that PettingZoo knows). Where it
-    takes continuous_actions, that is True unless `kwargs` says otherwise."""
+    class that makes a ParallelEnv, that class or function itself, or "sisl/multiwalker-v9" (an id
+    that PettingZoo knows). Where it takes continuous_actions, that is True unless `kwargs` says
+    otherwise."""
     api: ClassVar[str] = "pettingzoo"
-    signals: ClassVar[tuple[str, ...]] = ("global", "local")
+    rewards: tuple[tuple[str, str], ...] = eqx.field(static=True, default=(), converter=_makers)
+    """Who pays the reward of a name: {"global": arrived}, and `arrived(env, rewards, infos)`
+    returns one number for the team, or a dict by agent of a private reward. It is given the
+    environment behind the step, and what the step returned. A plain function of a module (its name
+    is recorded); one of a notebook, or a lambda, needs in_process=True."""
+    shared: tuple[str, ...] = eqx.field(static=True, default=("global",), converter=tuple)
+    """Rewards in `info["rewards"]` that are one number for the team; the others are private."""
+
+    def __check_init__(self):
+        alone = [name for name, maker in self.rewards if names.here_alone(maker)]
+        if alone and not self.here:
+            raise ValueError(
+                f"what pays the reward {alone[0]!r} cannot be imported by a worker: define the "
+                "function at the top of a module, or give in_process=True"
+            )
+
+    def _paid(self):
+        return {"rewards": [list(pair) for pair in self.rewards], "shared": list(self.shared)}
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        return tuple(name for name, _ in self._sizes()["signals"])
 
     @property
     def reported(self) -> str:
@@ -62,7 +95,8 @@ class PettingZoo(AbstractForeignEnvironment):
 
     @property
     def reward_shapes(self) -> dict[str, tuple[int, ...]]:
-        return {"global": (), "local": (self.agents,)}
+        team = (self.agents,)
+        return {name: team if private else () for name, private in self._sizes()["signals"]}
 
 
 class ParallelTeam(ParallelEnv):

@@ -1,12 +1,11 @@
 """Copies of an environment of others in a process of their own, and the pipe to it.
 
-`python -m credo.environments.worker` imports the standard library, NumPy, Gymnasium and the
-environment: no JAX. `Process` starts one and speaks to it; `Environments` is what it holds.
-A message is a header (kind, length) and raw arrays in the machine's byte order, JSON for opening
-and for faults; nothing is unpickled. Needs pipes and signals as Unix has them.
+Its `main` imports the standard library, NumPy, Gymnasium and the environment: no JAX. `Process`
+starts one and speaks to it; `Environments` is what it holds. A message is a header (kind, length)
+and raw arrays in the machine's byte order, JSON for opening and for faults; nothing is unpickled.
+Needs pipes and signals as Unix has them.
 """
 
-import array
 import contextlib
 import json
 import math
@@ -15,95 +14,162 @@ import os
 import select
 import signal
 import struct
-import subprocess
 import sys
 import tempfile
-import threading
 import time
 import traceback
 from typing import Any
 
 import numpy as np
 
+from . import processes
 from .adapters import APIS, Fault
 
 HEADER = struct.Struct("=II")  # kind, bytes that follow
-OPEN, RESET, STEP, FRAME, FAULT = range(5)
+OPEN, RESET, STEP, FRAME, FAULT, FAULTS = range(6)
+SIZES = (
+    "obs_size",
+    "obs_dtype",
+    "action_size",
+    "max_steps",
+    "discrete",
+    "agents",
+    "signals",
+    "actions",
+    "observations",
+    "obs_range",
+    "warnings",
+)
 GRACE = 2.0  # seconds that environments get to close themselves
+OPENING = 600.0  # seconds that opening one environment may take, if `timeout` is not longer
+LARGEST = float(np.finfo(np.float32).max)
+LOOK = "look at its id and kwargs, and whether its package is installed"
+MEND = "mend the environment"
 
 
 class Frame:
     """What `n` copies say, as arrays that look into the bytes of one message.
 
-    For a team rewards and observations have an axis of agents, and `active` says who acts next.
+    `sizes` is what `Environments.sizes` says. Observations are float32 or uint8; `rewards` has an
+    array per signal, float64, `[n]` or, of one that is private to each agent, `[n, agents]`.
+    `failed`: the copy's episode broke in this call, and its row is 0. For a team observations have
+    an axis of agents, `active` says who acts next, and `gone` who terminated with this step.
     """
 
-    def __init__(self, n: int, obs_size: int, agents: int | None):
-        rows = n * (agents or 1)
+    def __init__(self, n: int, sizes: dict[str, Any]):
+        agents, dtype = sizes["agents"], np.dtype(sizes["obs_dtype"])
         team = (n,) if agents is None else (n, agents)
-        obs = HEADER.size + 8 * rows
-        flags = obs + 4 * rows * obs_size
-        self.buffer = bytearray(flags + 2 * n + (0 if agents is None else rows))
-        HEADER.pack_into(self.buffer, 0, FRAME, len(self.buffer) - HEADER.size)
-        self.rewards = np.ndarray(team, np.float64, self.buffer, HEADER.size)
-        self.obs = np.ndarray((*team, obs_size), np.float32, self.buffer, obs)
-        self.terminated = np.ndarray(n, np.bool_, self.buffer, flags)
-        self.truncated = np.ndarray(n, np.bool_, self.buffer, flags + n)
-        self.active = None
-        if agents is not None:
-            self.active = np.ndarray(team, np.bool_, self.buffer, flags + 2 * n)
+        shapes = [team if private else (n,) for _, private in sizes["signals"]]
+        parts = [(shape, np.dtype(np.float64)) for shape in shapes]
+        parts.append(((*team, sizes["obs_size"]), dtype))
+        flags = [(n,)] * 3 + ([] if agents is None else [team] * 2)
+        self._parts = parts + [(shape, np.dtype(np.bool_)) for shape in flags]
+        self._names = [name for name, _ in sizes["signals"]]
+        self._length = sum(math.prod(shape) * dtype.itemsize for shape, dtype in self._parts)
+        self._lay()
+
+    def _lay(self) -> None:
+        self.buffer = bytearray(HEADER.size + self._length)
+        HEADER.pack_into(self.buffer, 0, FRAME, self._length)
+        arrays, at = [], HEADER.size
+        for shape, dtype in self._parts:
+            arrays.append(np.ndarray(shape, dtype, self.buffer, at))
+            at += arrays[-1].nbytes
+        self.rewards = dict(zip(self._names, arrays, strict=False))
+        self.obs, self.terminated, self.truncated, self.failed, *others = arrays[len(self._names) :]
+        self.active, self.gone = others or (None, None)
+        self.faults: dict[int, Fault] = {}  # why a copy failed
+
+    def fresh(self) -> "Frame":
+        """Another one of the same layout, all zeros."""
+        frame = object.__new__(Frame)
+        frame._parts, frame._names, frame._length = self._parts, self._names, self._length
+        frame._lay()
+        return frame
+
+    def fail(self, i: int, fault: Fault) -> None:
+        """The episode of copy `i` broke, and nothing that it says now counts."""
+        self.faults[i] = fault
+        for said in (self.obs, self.terminated, self.truncated, self.active, self.gone):
+            if said is not None:
+                said[i] = 0
+        for reward in self.rewards.values():
+            reward[i] = 0.0
+        self.failed[i] = True
 
 
 class Environments:
-    """`n` copies in this process, behind flat arrays. Raises `Fault`, and nothing else.
+    """`n` copies in this process, behind flat arrays.
+
+    What goes wrong in one copy ends its episode (`Frame.failed`, `Frame.faults`), and the copy is
+    opened anew before its next one. A wrong request, or one that cannot be opened at first, raises
+    `Fault`.
 
     `spec` has `id`, `kwargs` (a dict), `max_episode_steps` (a number or None) and, if it is not
-    Gymnasium's, `api`. `current[0]` is the copy that is being called: it may lie in memory shared
-    with whoever must know.
+    Gymnasium's, `api`. `current[0]` is the copy that is being called and `current[1]` is 1 while
+    it is being opened: they may lie in memory shared with whoever must know.
     """
 
     def __init__(self, spec: dict[str, Any], n: int, current: Any = None):
-        self.current = array.array("i", [0]) if current is None else current
-        self.n, self._envs = n, []
-        api = APIS[spec.get("api", "gymnasium")]
-        with _blaming("look at its id and kwargs, and whether its package is installed"):
+        self._alone = current is not None  # nobody's Ctrl-C is meant for this process
+        self.current = [0, 0] if current is None else current
+        self.n, self._spec, self._envs = n, spec, []
+        self._kind = APIS[spec.get("api", "gymnasium")]
+        try:
             for i in range(n):
-                self.current[0] = i
-                self._envs.append(api.make(spec))
-            self._api = api(self._envs[0], spec["max_episode_steps"])
-        self.obs_size, self.action_size = self._api.obs_size, self._api.action_size
+                self._envs.append(self._open(i))
+            self._api = self._kind(self._envs[0], spec)
+        except BaseException as error:
+            self.close()
+            raise self._fault(error, LOOK if len(self._envs) < n else MEND) from error
+        self._sizes = {name: getattr(self._api, name) for name in SIZES}
+        self._blank = Frame(n, self._sizes)
         self.agents, self.max_steps = self._api.agents, self._api.max_steps
-        self.discrete = self._api.discrete
+        self.action_size = self._api.action_size
         self._steps = [-1] * n  # in this episode; -1: there is none
+
+    def _open(self, i: int) -> Any:
+        self.current[0], self.current[1] = i, 1
+        try:
+            return self._kind.make(self._spec)
+        finally:
+            self.current[1] = 0
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> Frame:
         """Seeds `[n]`, uint32; active `[n]`."""
-        frame = Frame(self.n, self.obs_size, self.agents)
-        with _blaming():
-            for i in active.nonzero()[0].tolist():
-                self.current[0] = i
+        frame = self._blank.fresh()
+        for i in active.nonzero()[0].tolist():
+            self.current[0] = i
+            try:
+                if self._envs[i] is None:
+                    self._envs[i] = self._open(i)
                 self._api.reset(self._envs[i], int(seeds[i]), frame, i)
                 self._steps[i] = 0
+            except BaseException as error:
+                self._broke(frame, i, self._fault(error))
         self._finite(frame)
         return frame
 
     def step(self, actions: np.ndarray, active: np.ndarray) -> Frame:
         """Actions `[n, act]`, of a team `[n, agents, act]`, in [-1, 1], clipped to it; active
         `[n]`."""
-        frame = Frame(self.n, self.obs_size, self.agents)
-        with _blaming():
-            self._given(actions, active)
-            own, step, steps = self._api.read(actions), self._api.step, self._steps
-            for i in active.nonzero()[0].tolist():
-                self.current[0] = i
-                if steps[i] < 0:
-                    raise Fault("was asked for a step outside an episode", "reset this copy first")
+        frame = self._blank.fresh()
+        self._given(actions, active)
+        own, step, steps = self._api.read(actions), self._api.step, self._steps
+        for i in active.nonzero()[0].tolist():
+            self.current[0] = i
+            if steps[i] < 0:
+                raise Fault("was asked for a step outside an episode", "reset this copy first")
+            try:
                 over = step(self._envs[i], own[i], frame, i)
-                steps[i] += 1
-                if steps[i] >= self.max_steps:
-                    frame.truncated[i] = over = True
-                if over:
-                    steps[i] = -1
+            except BaseException as error:
+                self._broke(frame, i, self._fault(error))
+                continue
+            steps[i] += 1
+            if steps[i] >= self.max_steps:
+                frame.truncated[i] = over = True
+            if over:
+                steps[i] = -1
         self._finite(frame)
         return frame
 
@@ -117,21 +183,41 @@ class Environments:
                 raise Fault(f"was given the action {actions[i].tolist()}", told)
 
     def _finite(self, frame: Frame) -> None:
-        """One look at all copies; rows of those that are not active are 0."""
-        if np.isfinite(frame.obs).all() and np.isfinite(frame.rewards).all():
+        """One look at all copies: learners have float32. Rows that are not active are 0."""
+        rewards = frame.rewards.values()
+        if np.isfinite(frame.obs).all() and all((abs(x) <= LARGEST).all() for x in rewards):
             return
-        obs, rewards = (x.reshape(self.n, -1) for x in (frame.obs, frame.rewards))
-        good = np.isfinite(obs).all(axis=1) & np.isfinite(rewards).all(axis=1)
-        self.current[0] = i = int(np.flatnonzero(~good)[0])
-        told = "the reward" if np.isfinite(frame.obs[i]).all() else "an observation"
-        raise Fault(
-            f"returned NaN or inf in {told}",
-            "guard the division, root or logarithm it is from, or end the episode before",
-        )
+        seen = np.isfinite(frame.obs.reshape(self.n, -1)).all(axis=1)
+        paid = [(abs(x.reshape(self.n, -1)) <= LARGEST).all(axis=1) for x in rewards]
+        for i in np.flatnonzero(~(seen & np.all(paid, axis=0))).tolist():
+            what = "returned NaN or inf in " + ("the reward" if seen[i] else "an observation")
+            if seen[i] and all(np.isfinite(x[i]).all() for x in rewards):
+                what = "returned a reward that is too large for float32"
+            how = "guard the division, root or logarithm it is from, or end the episode before"
+            self._broke(frame, i, Fault(what, how))
+
+    def _broke(self, frame: Frame, i: int, fault: Fault) -> None:
+        frame.fail(i, fault)
+        self._steps[i] = -1
+        if i < len(self._envs) and self._envs[i] is not None:
+            with contextlib.suppress(Exception):
+                self._envs[i].close()
+            self._envs[i] = None
+
+    def _fault(self, error: BaseException, fix: str = MEND) -> Fault:
+        """What an environment raised, told. Ctrl-C in the user's own process is the user's."""
+        if isinstance(error, Fault):
+            return error
+        if isinstance(error, KeyboardInterrupt) and not self._alone:
+            raise error
+        if isinstance(error, processes.Refused):
+            return Fault(f"cannot be opened: {error.what}", error.fix)
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        what = f"raised {type(error).__name__}: {error} ({place.filename}:{place.lineno})"
+        return Fault(what, fix)
 
     def sizes(self) -> dict[str, Any]:
-        names = ("obs_size", "action_size", "max_steps", "discrete", "agents")
-        return {name: getattr(self, name) for name in names}
+        return self._sizes
 
     usable = True
 
@@ -141,32 +227,21 @@ class Environments:
                 env.close()
 
 
-class _blaming:
-    """What an environment raises becomes a `Fault`. (A generator would cost twice the time.)"""
-
-    def __init__(self, fix: str = "mend the environment"):
-        self.fix = fix
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind, error, trace) -> None:
-        if error is None or isinstance(error, Fault | KeyboardInterrupt):
-            return
-        place = traceback.extract_tb(trace)[-1]
-        what = f"raised {kind.__name__}: {error} ({place.filename}:{place.lineno})"
-        raise Fault(what, self.fix) from error
+class Lost(Fault):
+    """The worker is gone, or gives no answer: the episodes of all its copies are over."""
 
 
-def _message(kind: int, value: dict[str, Any]) -> bytes:
+def _message(kind: int, value: Any) -> bytes:
     text = json.dumps(value).encode()
     return HEADER.pack(kind, len(text)) + text
 
 
 class Process:
-    """The same as `Environments`, in a worker process. No call takes longer than `timeout` seconds.
+    """The same as `Environments`, in a worker process. No copy takes longer than `timeout` seconds
+    for a reset or a step. (What is listed in `Frame.faults` is the copy's own.)
 
-    After a `Fault` it is of no use: close it.
+    After a `Fault` it is of no use: close it. `Lost` means that the worker failed, and
+    `current[0]` is the copy that it was calling.
     """
 
     def __init__(self, spec: dict[str, Any], n: int, timeout: float):
@@ -174,22 +249,30 @@ class Process:
         requests, self._out = os.pipe()
         self._in, replies = os.pipe()
         os.set_blocking(self._out, False)
-        with tempfile.TemporaryFile() as shared:
-            shared.truncate(mmap.PAGESIZE)
-            self.current = memoryview(mmap.mmap(shared.fileno(), mmap.PAGESIZE)).cast("i")
-            self._process = _start(requests, replies, shared.fileno())
-        os.close(requests)
-        os.close(replies)
+        try:
+            with tempfile.TemporaryFile() as shared:
+                shared.truncate(mmap.PAGESIZE)
+                self.current = memoryview(mmap.mmap(shared.fileno(), mmap.PAGESIZE)).cast("i")
+                self._process = _start(requests, replies, shared.fileno())
+        except BaseException:
+            os.close(self._in)
+            os.close(self._out)
+            raise
+        finally:
+            os.close(requests)
+            os.close(replies)
         self._readable, self._writable = select.poll(), select.poll()
         self._readable.register(self._in, select.POLLIN)
         self._writable.register(self._out, select.POLLOUT)
+        if self._process.ending is not None:
+            self._readable.register(self._process.ending, select.POLLIN)
+        message = _message(OPEN, {"spec": spec, "n": n})
         try:
-            reply = self._ask(_message(OPEN, {"spec": spec, "n": n}), bytearray(HEADER.size))
+            self._sizes = json.loads(self._ask(message, bytearray(HEADER.size))[HEADER.size :])
         except BaseException:
             self.close(grace=0.0)
             raise
-        self._sizes = json.loads(reply[HEADER.size :])
-        self.obs_size, self.action_size = self._sizes["obs_size"], self._sizes["action_size"]
+        self._blank = Frame(n, self._sizes)
 
     def sizes(self) -> dict[str, Any]:
         return self._sizes
@@ -205,9 +288,13 @@ class Process:
         return self._call(STEP, actions, active)
 
     def _call(self, kind: int, numbers: np.ndarray, active: np.ndarray) -> Frame:
-        frame = Frame(self.n, self.obs_size, self._sizes["agents"])
+        frame = self._blank.fresh()
         payload = numbers.tobytes() + active.tobytes()
         self._ask(HEADER.pack(kind, len(payload)) + payload, frame.buffer)
+        if frame.failed.any():  # why, is in a message of its own
+            self._idle = False
+            told = self._reply(bytearray(HEADER.size))
+            frame.faults = {i: Fault(*why) for i, *why in json.loads(told[HEADER.size :])}
         return frame
 
     def _ask(self, request: bytes, reply: bytearray) -> bytearray:
@@ -215,53 +302,66 @@ class Process:
         if not self._idle:
             raise Fault("was interrupted in an earlier call", "ask for copies(n) again")
         self._idle = False
-        deadline = time.monotonic() + self._timeout
-        self._send(request, deadline)
-        got = self._receive(reply, 0, HEADER.size, deadline)
+        self._send(request)
+        return self._reply(reply)
+
+    def _reply(self, reply: bytearray) -> bytearray:
+        got = self._receive(reply, 0, HEADER.size)
         kind, length = HEADER.unpack_from(reply)
         if HEADER.size + length != len(reply):
             reply = reply[:got] + bytearray(HEADER.size + length - got)
-        self._receive(reply, got, len(reply), deadline)
+        self._receive(reply, got, len(reply))
         if kind == FAULT:
             raise Fault(**json.loads(reply[HEADER.size :]))
         self._idle = True
         return reply
 
-    def _send(self, request: bytes, deadline: float) -> None:
+    def _send(self, request: bytes) -> None:
         try:
             sent = os.write(self._out, request)
             while sent < len(request):  # more than a pipe holds
-                self._wait(self._writable, deadline)
+                self._wait(self._writable)
                 sent += os.write(self._out, request[sent:])
         except BrokenPipeError:
             raise self._ended() from None
 
-    def _receive(self, into: bytearray, got: int, least: int, deadline: float) -> int:
+    def _receive(self, into: bytearray, got: int, least: int) -> int:
         """Read until there are at least so many bytes; how many there are."""
         view = memoryview(into)
         while got < least:
-            self._wait(self._readable, deadline)
+            if self._in not in self._wait(self._readable):
+                raise self._ended()  # though somebody it started may hold the pipe open
             count = os.readv(self._in, [view[got:]])
             if count == 0:
                 raise self._ended()
             got += count
         return got
 
-    def _wait(self, pipe: select.poll, deadline: float) -> None:
-        if not pipe.poll(max(0.0, 1000 * (deadline - time.monotonic()))):
-            raise Fault(
-                f"gave no answer within {self._timeout:g} s",
-                "mend what hangs, or set a longer timeout if it is only slow",
-            )
+    def _wait(self, pipe: select.poll) -> list[int]:
+        """Until something can be done: with what. Each copy that is called has its own time."""
+        seen, began = None, time.monotonic()
+        while not (ready := pipe.poll(min(1000.0, 100 * self._timeout))):
+            copy, opening = self.current[0], self.current[1]
+            now, limit = time.monotonic(), self._timeout
+            if opening:
+                limit = max(limit, OPENING)
+            if (copy, opening) != seen:
+                seen, began = (copy, opening), began if seen is None else now
+            elif now - began > limit:
+                raise Lost(
+                    f"gave no answer within {limit:g} s",
+                    "mend what hangs, or set a longer timeout if it is only slow",
+                )
+        return [descriptor for descriptor, _ in ready]
 
-    def _ended(self) -> Fault:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(GRACE)
-        status = self._process.returncode
-        how = f"with exit status {status}"
-        if status is not None and status < 0:
-            how = f"by {signal.Signals(-status).name}"
-        return Fault(f"ended its process {how}", "see what it wrote to the error stream")
+    def _ended(self) -> Lost:
+        how = "and left it running"
+        if self._process.over(GRACE):
+            status = self._process.returncode
+            how = f"with exit status {status}"
+            if status < 0:
+                how = f"by {signal.Signals(-status).name}"
+        return Lost(f"ended its process {how}", "see what it wrote to the error stream")
 
     def close(self, grace: float = GRACE) -> None:
         """End the process: let it close its environments for `grace` seconds, then by force."""
@@ -270,28 +370,16 @@ class Process:
         os.close(self._out)
         self._out = -1
         self._idle = False
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(grace)
-        if self._process.poll() is None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)  # with all that it started
-        self._process.wait()
+        self._process.end(grace)
         os.close(self._in)
 
 
-def _start(*descriptors: int) -> subprocess.Popen:
-    """The worker: it finds modules where this process does, and never writes to its output."""
-    path = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)
+def _start(*descriptors: int) -> processes.Child:
+    """The worker, which never writes to its parent's output."""
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    arguments = [str(number) for number in (*descriptors, os.getpid())]
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", __name__, *arguments],
-        env={**threads, **os.environ, "PYTHONPATH": path},
-        stdin=subprocess.DEVNULL,
-        stdout=2,
-        pass_fds=descriptors,
-        start_new_session=True,  # Ctrl-C is for the parent
-    )
+    arguments = [str(number) for number in descriptors]
+    environment = {**threads, **os.environ}
+    return processes.Child(__name__, *arguments, env=environment, stdout=2, pass_fds=descriptors)
 
 
 def _serve(requests: int, replies: int, current: memoryview) -> None:
@@ -303,11 +391,16 @@ def _serve(requests: int, replies: int, current: memoryview) -> None:
             payload = source.read(length)
             try:
                 if kind == OPEN:
+                    current[1] = 1
                     environments = Environments(**json.loads(payload), current=current)
                     reply = _message(OPEN, environments.sizes())
                 else:
                     assert environments is not None
-                    reply = _answer(environments, kind, payload).buffer
+                    frame = _answer(environments, kind, payload)
+                    reply = bytes(frame.buffer) if frame.faults else frame.buffer
+                    if frame.faults:
+                        whys = [[i, why.what, why.fix] for i, why in frame.faults.items()]
+                        reply += _message(FAULTS, whys)
             except Fault as fault:
                 reply = _message(FAULT, {"what": fault.what, "fix": fault.fix})
             rest = memoryview(reply)
@@ -327,21 +420,9 @@ def _answer(environments: Environments, kind: int, payload: bytes) -> Frame:
     return environments.step(actions if environments.agents else actions[:, 0], active)
 
 
-def _watch(parent: int) -> None:
-    """End with the parent, even in the middle of a step."""
-    while os.getppid() == parent:
-        time.sleep(0.5)
-    os._exit(1)
-
-
 def main() -> None:
-    requests, replies, shared, parent = (int(number) for number in sys.argv[1:])
+    requests, replies, shared = (int(number) for number in sys.argv[1:])
     for descriptor in (requests, replies, shared):
         os.set_inheritable(descriptor, False)
-    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
     current = memoryview(mmap.mmap(shared, mmap.PAGESIZE)).cast("i")
     _serve(requests, replies, current)
-
-
-if __name__ == "__main__":
-    main()

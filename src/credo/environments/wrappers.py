@@ -1,5 +1,8 @@
 """Tasks made of other tasks."""
 
+import dataclasses
+import threading
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -112,7 +115,7 @@ class NoisyObservations(AbstractWrapper):
         noisy = jnp.arange(self.obs_size) < self.obs_size - self.spared
         noise = self.std * jax.random.normal(key, now.obs.shape)
         obs = now.obs + jnp.where(noisy, noise, 0.0)
-        return TimeStep(obs, now.rewards, now.terminated, now.truncated, now.active)
+        return dataclasses.replace(now, obs=obs)
 
 
 def delayed(
@@ -151,8 +154,7 @@ class DelayedReward(AbstractWrapper):
         earned = {name: state.earned[name] + reward for name, reward in now.rewards.items()}
         ended = now.terminated | now.truncated
         paid = {name: jnp.where(ended, sum_, 0.0) for name, sum_ in earned.items()}
-        now = TimeStep(now.obs, paid, now.terminated, now.truncated, now.active)
-        return DelayedState(inner, earned), now
+        return DelayedState(inner, earned), dataclasses.replace(now, rewards=paid)
 
 
 class DelayedHostReward(AbstractHostEnvironment):
@@ -196,17 +198,44 @@ class DelayedHostReward(AbstractHostEnvironment):
     def reward_shapes(self) -> dict[str, tuple[int, ...]]:
         return self.env.reward_shapes
 
+    @property
+    def obs_dtype(self) -> str:
+        return self.env.obs_dtype
+
+    @property
+    def at_once(self) -> int | None:
+        return self.env.at_once
+
+    @property
+    def obs_range(self):
+        return self.env.obs_range
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        return self.env.warnings
+
+    def task_record(self):
+        return self.env.task_record()
+
     def copies(self, n: int) -> "DelayedCopies":
         inner = self.env.copies(n)
-        if (self, n) not in _DELAYED or _DELAYED[self, n].inner is not inner:
-            _DELAYED[self, n] = DelayedCopies(inner, self.reward_shapes)
-        return _DELAYED[self, n]
+        kept = _DELAYED.copies
+        if (self, n) not in kept or kept[self, n].inner is not inner:
+            kept[self, n] = DelayedCopies(inner, self.reward_shapes)
+        return kept[self, n]
 
 
 class DelayedCopies(AbstractCopies):
     def __init__(self, inner: AbstractCopies, shapes: dict[str, tuple[int, ...]]):
         self.inner, self.n = inner, inner.n
         self._earned = {name: np.zeros((inner.n, *shape)) for name, shape in shapes.items()}
+
+    @property
+    def failed(self) -> np.ndarray | None:
+        return self.inner.failed
+
+    def failure_text(self, i: int) -> str:
+        return self.inner.failure_text(i)
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
         for earned in self._earned.values():
@@ -221,7 +250,14 @@ class DelayedCopies(AbstractCopies):
             lanes = (-1,) + (1,) * (earned.ndim - 1)
             np.add(earned, now.rewards[name], out=earned, where=active.reshape(lanes))
             paid[name] = np.where((ended & active).reshape(lanes), earned, 0.0)
-        return HostStep(now.obs, paid, now.terminated, now.truncated, now.active)
+        return dataclasses.replace(now, rewards=paid)
 
 
-_DELAYED: dict[tuple[DelayedHostReward, int], DelayedCopies] = {}
+class _Kept(threading.local):
+    """Of each thread its own, as the copies inside are."""
+
+    def __init__(self):
+        self.copies: dict[tuple[DelayedHostReward, int], DelayedCopies] = {}
+
+
+_DELAYED = _Kept()

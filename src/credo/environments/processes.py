@@ -1,0 +1,238 @@
+"""Child processes of ours: how they start, and that nothing of them is left.
+
+`Child` runs the `main` of a module in a process of its own. Between it and us stands a guardian
+(this file, run as a script), which on Linux inherits every process that the child starts, however
+it detaches itself, and kills them all when the child ends, when it is told to, or when we are
+gone, even by kill -9. If the guardian itself is killed, the child is too. On other systems than
+Linux it kills the child's process group alone. The standard library, and no more, is imported here.
+"""
+
+import contextlib
+import ctypes
+import importlib
+import json
+import os
+import pathlib
+import select
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+LINUX = sys.platform == "linux"
+PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
+LONGEST = 5.0  # seconds that a guardian gets to kill what it guards
+MULTIPLYING = "put it under if __name__ == '__main__'"
+
+_worker = False  # whether this process is somebody's child, started here
+_forked = False  # whether it was forked from one in which JAX has threads
+
+
+class Refused(RuntimeError):
+    """Here nothing may be trained and no process started: `what` is the reason, `fix` the way."""
+
+    def __init__(self, what: str, fix: str):
+        super().__init__(f"{what}: {fix}")
+        self.what, self.fix = what, fix
+
+
+def allow(doing: str = "starts training") -> None:
+    """Raise `Refused` where training, or a child of ours, would multiply or never end: while a
+    child imports the user's script, and in a process forked after JAX was used."""
+    if _forked:
+        raise Refused(
+            "this process was forked after JAX was used, and JAX would wait in it for ever",
+            "start it afresh, as multiprocessing does with the method 'spawn' or 'forkserver', or "
+            "use Credo in it alone",
+        )
+    frame, script = sys._getframe() if _worker else None, None
+    while frame is not None:
+        if frame.f_code.co_name == "<module>" and frame.f_back is not None:
+            script = script or pathlib.Path(frame.f_code.co_filename).stem
+        frame = frame.f_back
+    if script is not None:
+        raise Refused(f"{script} {doing} when it is imported", MULTIPLYING)
+
+
+def _after_fork() -> None:
+    global _forked
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    _forked = bool(getattr(bridge, "_backends", None))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+class Child(subprocess.Popen):
+    """`module.main()` in a process of its own, with `sys.argv[1:]` as given. Its `pid` is the
+    guardian's, and its return code what the child ended with.
+
+    It finds modules where this process does. Whoever holds it calls `end`.
+
+    **Arguments:** `grace`, seconds that the child gets after SIGTERM when this process is gone or
+    ends it by force; 0 kills it at once. `options` are those of `subprocess.Popen`.
+    """
+
+    def __init__(self, module: str, *arguments: str, grace: float = 0.0, **options: Any):
+        allow()
+        self._owner = os.getpid()
+        self.ending = None
+        path = json.dumps([os.path.abspath(entry) for entry in sys.path])
+        told = [module, path, str(grace), str(self._owner), *arguments]
+        options = {"stdin": subprocess.DEVNULL, "start_new_session": True} | options
+        super().__init__([sys.executable, "-P", os.path.abspath(__file__), *told], **options)
+        self._grace = grace
+        self.ending = _pidfd(self.pid)
+        """Readable once the child has ended; None where there is no such thing."""
+
+    def end(self, grace: float) -> None:
+        """Wait `grace` seconds for the child to end by itself, then use force."""
+        if os.getpid() != self._owner:  # forked: it is not ours
+            return
+        for patience, force in ((grace, self.terminate), (self._grace + LONGEST, self.kill)):
+            if not self.over(patience):
+                force()
+        self.wait()
+        if self.ending is not None:
+            os.close(self.ending)
+            self.ending = None
+
+    def over(self, patience: float) -> bool:
+        """Whether it has ended, or does within so many seconds."""
+        if self.ending is not None and self.returncode is None:
+            ended = select.poll()
+            ended.register(self.ending, select.POLLIN)
+            ended.poll(max(0.0, 1000 * patience))  # at once; `wait` would look now and then
+            patience = 0.0
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.wait(patience)
+        return self.returncode is not None
+
+
+def _pidfd(pid: int) -> int | None:
+    if not hasattr(os, "pidfd_open"):
+        return None
+    with contextlib.suppress(OSError):
+        return os.pidfd_open(pid)
+    return None
+
+
+def _control(option: int, value: int) -> None:
+    """Linux: tell the kernel something about this process."""
+    if LINUX:
+        ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
+
+
+def _guardian(module: str, path: str, grace: str, parent: str, *arguments: str) -> None:
+    """Run the child, and in this process guard it. Only the child returns."""
+    mine = os.getpid()
+    _control(PR_SET_CHILD_SUBREAPER, 1)
+    wake, tell = os.pipe()
+    for end in (wake, tell):
+        os.set_blocking(end, False)
+    for number in (signal.SIGCHLD, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)  # what counts is the byte in the pipe
+    signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
+    worker = os.fork()
+    if worker == 0:
+        signal.set_wakeup_fd(-1)
+        for number in (signal.SIGCHLD, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)
+        os.close(wake)
+        os.close(tell)
+        os.setpgid(0, 0)
+        _control(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != mine:
+            os._exit(1)
+        sys.path[:] = json.loads(path)
+        sys.argv = [module, *arguments]
+        importlib.import_module("credo.environments.processes")._worker = True
+        importlib.import_module(module).main()
+        return
+    _let_go(wake, tell)
+    status = None
+    with contextlib.suppress(BaseException):
+        status = _wait(worker, int(parent), wake, float(grace))
+    _kill_all(worker)
+    _end_like(status)
+
+
+def _let_go(*kept: int) -> None:
+    """Pipes are the child's: here they would hide that it has closed them."""
+    nothing = os.open(os.devnull, os.O_RDWR)
+    os.dup2(nothing, 0)
+    os.dup2(nothing, 1)
+    for descriptor in map(int, os.listdir("/dev/fd")):
+        if descriptor > 2 and descriptor not in kept:
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+
+
+def _wait(worker: int, parent: int, wake: int, grace: float) -> int:
+    """Until the child has ended, or must: what it ended with, as `os.waitpid` says it."""
+    events, gone, deadline = select.poll(), _pidfd(parent), None
+    events.register(wake, select.POLLIN)
+    if gone is not None:
+        events.register(gone, select.POLLIN)
+    while True:
+        events.poll(None if gone is not None and deadline is None else 200)
+        told = b""
+        with contextlib.suppress(BlockingIOError):
+            told = os.read(wake, 4096)
+        for pid, status in _ended():
+            if pid == worker:
+                return status
+        if deadline is None and (signal.SIGTERM in told or os.getppid() != parent):
+            deadline = time.monotonic() + grace
+            if gone is not None:
+                events.unregister(gone)
+            if grace > 0:
+                os.kill(worker, signal.SIGTERM)
+        if deadline is not None and time.monotonic() >= deadline:
+            os.kill(worker, signal.SIGKILL)
+            return signal.SIGKILL
+
+
+def _ended() -> list[tuple[int, int]]:
+    """Every process here that has ended since the last look, and how."""
+    found = []
+    with contextlib.suppress(ChildProcessError):
+        while (one := os.waitpid(-1, os.WNOHANG))[0] != 0:
+            found.append(one)
+    return found
+
+
+def _kill_all(worker: int) -> None:
+    with contextlib.suppress(OSError):
+        os.killpg(worker, signal.SIGKILL)
+    children = pathlib.Path(f"/proc/self/task/{os.getpid()}/children")
+    while children.exists():
+        # Whose parent is killed comes here, so that in the end nobody is left.
+        left = children.read_text().split()
+        for pid in left:
+            with contextlib.suppress(OSError):
+                os.kill(int(pid), signal.SIGKILL)
+        if not _ended() and not left:
+            return
+        time.sleep(0.002)
+
+
+def _end_like(status: int | None) -> None:
+    """End with the child's exit status, or by the signal that ended it."""
+    status = 1 << 8 if status is None else status
+    if os.WIFSIGNALED(status):
+        import resource
+
+        number = os.WTERMSIG(status)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        if number != signal.SIGKILL:
+            signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
+        time.sleep(1.0)
+    os._exit(os.waitstatus_to_exitcode(status) & 0xFF)
+
+
+if __name__ == "__main__":
+    _guardian(*sys.argv[1:])
