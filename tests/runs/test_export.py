@@ -24,7 +24,7 @@ from credo.runner import DESCRIPTION, VERSION, Runner
 from credo.runs import checkpoint, config
 from credo.runs.export import export, parts_of
 from credo.runs.loop import Run, RunError
-from credo.runs.policy import Policy, described
+from credo.runs.policy import Policy
 
 STEPS = 60
 NETWORKS = [
@@ -86,7 +86,7 @@ def made(path, env, network, seed=0, action=None) -> Run:
     policy = network.init(*env.sizes, key=jax.random.key(seed))
     checkpoint.export_policy(path / "champion.safetensors", policy)
     task = {name: getattr(env, name) for name in ("obs_size", "action_size", "agents", "discrete")}
-    task["actions"] = action and described(action)
+    task["actions"] = action and adapters._described(action)
     record = {"algorithm": config.to_tree(algorithm), "seed": seed, "task": task}
     config.write_json(path / "config.json", record)
     return Run(path)
@@ -169,7 +169,10 @@ def test_a_team_in_a_file_acts_in_each_agents_units_and_opens_nothing(tmp_path):
     ]
     wrapped = {"class": "credo.environments.wrappers:DelayedHostReward", "env": env}
     run.config["algorithm"]["env"] = wrapped
-    run.config["task"] |= {"actions": [described(box) for box in boxes], "names": ["a", "b", "c"]}
+    run.config["task"] |= {
+        "actions": [adapters._described(box) for box in boxes],
+        "names": ["a", "b", "c"],
+    }
     policy, act = run.policy(), Runner.load(export(run, tmp_path / "p.safetensors"))
     assert act.description["task"] == "not_there:Crew"
     for rows in np.random.default_rng(0).normal(size=(20, 3, spread.obs_size)):

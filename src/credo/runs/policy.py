@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,7 +66,8 @@ class Policy:
 
 def of(run: Any, raw: bool = False) -> Policy:
     """The best policy of a `Run` in its task's units; `raw`: with actions in [-1, 1]."""
-    return Policy(champion(run), task_of(run), raw=raw)
+    task = run.config.get("task") if raw else task_of(run)
+    return Policy(champion(run), task, raw=raw)
 
 
 def champion(run: Any) -> PyTree:
@@ -123,43 +123,14 @@ def task_of(run: Any) -> Mapping[str, Any]:
         return run.config["task"]
     env = run.algorithm.env
     foreign = undelayed(env)
-    record = {name: getattr(env, name) for name in ("obs_size", "action_size", "agents")}
-    if not isinstance(foreign, AbstractForeignEnvironment):
-        return record | {"actions": None}
-    code = getattr(foreign, "foreign_code", None)
-    if code is None:
-        return record | _opened(foreign)
-    warnings.warn(
-        f"{run.path} was made by an older Credo, which did not record the units of {code}: actions "
-        "lie in [-1, 1], -1 is the low of a Box and 1 its high",
-        stacklevel=3,
-    )
-    return record | {"actions": None}
-
-
-def _opened(task: AbstractForeignEnvironment) -> dict[str, Any]:
-    """The spaces of a task of others, as a record has them."""
-    from .watch import opened  # which plays policies
-
-    with opened(task) as copy:
-        env: Any = copy._envs[0]
-        if copy.agents is None:
-            return {
-                "actions": described(env.action_space),
-                "observations": discrete(env.observation_space),
-            }
-        return {"actions": [described(env.action_space(name)) for name in env.possible_agents]}
-
-
-def described(space: gymnasium.Space) -> dict[str, Any]:
-    """An action space as JSON."""
-    if isinstance(space, gymnasium.spaces.Discrete):
-        return {"n": int(space.n), "start": int(space.start)}
-    assert isinstance(space, gymnasium.spaces.Box)  # or it could not have been opened
-    low, high = (np.float64(bound).ravel().tolist() for bound in (space.low, space.high))
-    return {"low": low, "high": high, "shape": list(space.shape), "dtype": str(space.dtype)}
-
-
-def discrete(space: gymnasium.Space) -> dict[str, int] | None:
-    """A Discrete of observations as JSON; None for others, which are given as arrays."""
-    return described(space) if isinstance(space, gymnasium.spaces.Discrete) else None
+    if isinstance(foreign, AbstractForeignEnvironment):
+        if foreign.foreign_code is None:
+            return foreign.task_record()
+        warnings.warn(
+            f"{run.path} was made by an older Credo, which did not record the units of "
+            f"{foreign.foreign_code}: actions lie in [-1, 1], -1 is the low of a Box and 1 its "
+            "high",
+            stacklevel=3,
+        )
+    sizes = {name: getattr(env, name) for name in ("obs_size", "action_size", "agents")}
+    return sizes | {"actions": None}

@@ -135,11 +135,9 @@ def _film(
 def opened(task: AbstractForeignEnvironment, **kwargs: Any) -> Iterator[worker.Environments]:
     """One copy of a task in this process, with further arguments, behind the flat arrays that its
     worker has."""
-    limit = task.max_episode_steps
-    spec = {"api": task.api, "id": task.id, "kwargs": dict(task.kwargs) | kwargs}
-    copy = None
+    spec, copy = task.spec(), None
     try:
-        copy = worker.Environments(spec | {"max_episode_steps": limit}, 1)
+        copy = worker.Environments(spec | {"kwargs": spec["kwargs"] | kwargs}, 1)
         yield copy
     except worker.Fault as fault:
         chosen = os.environ.get("MUJOCO_GL", "")  # its library is loaded with MuJoCo
@@ -257,15 +255,21 @@ def _pictures(
     active = np.ones(1, np.bool_)
     for seed in seeds:
         policy.reset()
-        frame = copy.reset(np.array([seed % 2**32], np.uint32), active)
+        frame = _sound(copy.reset(np.array([seed % 2**32], np.uint32), active))
         yield _draw(env.render, name, env)
         step, ended = 0, False
         while not ended:
-            frame = copy.step(policy(frame.obs[0])[None], active)
+            frame = _sound(copy.step(policy(frame.obs[0])[None], active))
             step += 1
             ended = bool(frame.terminated[0] or frame.truncated[0])
             if ended or step % stride == 0:
                 yield _draw(env.render, name, env)
+
+
+def _sound(frame: worker.Frame) -> worker.Frame:
+    for fault in frame.faults.values():
+        raise fault
+    return frame
 
 
 def _scenes(task: Any, policy: Policy, seeds: range, stride: int) -> Iterator[np.ndarray]:
