@@ -122,7 +122,7 @@ class Units:
             self.agents = _size("agents", agents, MOST_AGENTS)
         self.names = self._one_each("names", task.get("names"))
         self._discrete = self._observed(task.get("observations"))
-        spaces = task["action"] if "action" in task else task["actions"]
+        spaces = task.get("action", task.get("actions"))
         self._own = None if spaces is None else self._scales(spaces)
 
     def act(self, observation: Any, step: Callable[[np.ndarray], Any], mask: Any = None) -> Any:

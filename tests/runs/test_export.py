@@ -89,7 +89,7 @@ def made(path, env, network, seed=0, action=None) -> Run:
     task["actions"] = action and adapters._described(action)
     record = {"algorithm": config.to_tree(algorithm), "seed": seed, "task": task}
     config.write_json(path / "config.json", record)
-    return Run(path)
+    return Run(path, trust=True)
 
 
 def loaded(policy, agents=None, obs_size=4, action_size=2) -> Runner:

@@ -93,7 +93,7 @@ def test_a_new_file_takes_nobodys_place(precious):
 def test_append_goes_through_no_link_and_waits_for_no_reader(precious):
     folder = precious.parent / "folder"
     (folder / "link").symlink_to(precious)
-    with pytest.raises(OSError, match=r"is a link, which is never followed: .*link'"):
+    with pytest.raises(OSError, match=r"is a link and not followed: remove it: .*link'"):
         files.append(folder / "link", b"x")
     os.mkfifo(folder / "pipe")
     with pytest.raises(OSError, match="pipe'"):

@@ -68,10 +68,10 @@ def test_a_refusal_leaves_the_holders_name(tmp_path):
         assert (tmp_path / "lock").read_text() == before != ""
 
 
-@pytest.mark.parametrize("content", ["", "not JSON", "[]", "{}"])
+@pytest.mark.parametrize("content", [b"", b"not JSON", b"[]", b"{}", b"\xb1"])
 def test_a_holder_without_a_name(tmp_path, content):
     with lock(tmp_path):
-        (tmp_path / "lock").write_text(content)
+        (tmp_path / "lock").write_bytes(content)
         with pytest.raises(RunLocked, match="in use by another process: wait"), lock(tmp_path):
             pass
 
@@ -80,3 +80,29 @@ def test_two_runs_do_not_share_a_lock(tmp_path):
     with lock(tmp_path / "a"), lock(tmp_path / "b"):
         assert (tmp_path / "a" / "lock").read_text() != ""
         assert (tmp_path / "b" / "lock").read_text() != ""
+
+
+@pytest.mark.parametrize("target", ["precious", "none"])
+def test_a_link_is_no_lock_and_is_not_followed(tmp_path, target):
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "lock").symlink_to(tmp_path / target)
+    with pytest.raises(OSError, match=r"is a link and not followed: remove it: .*run/lock'"):
+        lock(tmp_path / "run").__enter__()
+    assert (tmp_path / "precious").read_text() == "precious"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["precious", "run"]
+
+
+def test_a_file_with_a_second_name_is_not_emptied(tmp_path):
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "lock").hardlink_to(tmp_path / "precious")
+    with lock(tmp_path / "run"), pytest.raises(RunLocked), lock(tmp_path / "run"):
+        pass
+    assert (tmp_path / "precious").read_text() == "precious"
+
+
+def test_a_pipe_is_no_lock_and_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "lock")
+    with pytest.raises(OSError, match="is no regular file"):
+        lock(tmp_path).__enter__()

@@ -1,7 +1,13 @@
 """Metrics on disk: text that comes back as the same floats, and the cut of a resumed run."""
 
+import hashlib
 import json
 import os
+import shutil
+import struct
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +22,10 @@ def rows(first: int, last: int) -> list[dict[str, float | int]]:
         {"generation": g, "score": float(values[g]), "nan": int(g == 2)}
         for g in range(first, last + 1)
     ]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
 
 
 @pytest.fixture
@@ -46,8 +56,8 @@ def test_sync_puts_both_files_on_the_disk(written, monkeypatch):
     synced = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_ino))
     log.Log(written, 5, tensorboard=False).sync()
-    names = ("metrics.csv", "timing.csv")
-    assert synced == [(written / name).stat().st_ino for name in names]
+    paths = (written / "metrics.csv", written, written / "timing.csv")
+    assert synced == [path.stat().st_ino for path in paths]
 
 
 def test_nan_and_infinity_come_back(tmp_path):
@@ -92,16 +102,258 @@ def test_there_is_nothing_to_read_before_the_first_row(tmp_path):
     assert log.read(tmp_path / "metrics.csv") == {}
 
 
-def test_tensorboard_gets_every_metric_of_every_generation(tmp_path, monkeypatch):
-    import tensorboardX
+def events(folder: Path) -> list:
+    """All events in the one file of `folder`, their checksums checked."""
+    from tensorboardX.proto.event_pb2 import Event
+    from tensorboardX.record_writer import masked_crc32c
 
-    seen = []
-    monkeypatch.setattr(
-        tensorboardX.SummaryWriter, "add_scalar", lambda self, *event: seen.append(event)
-    )
+    (path,) = folder.iterdir()
+    data, found = path.read_bytes(), []
+    while data:
+        (size,) = struct.unpack("<Q", data[:8])
+        body = data[12 : 12 + size]
+        sums = struct.unpack("<I", data[8:12]) + struct.unpack("<I", data[12 + size : 16 + size])
+        assert sums == (masked_crc32c(data[:8]), masked_crc32c(body))
+        found.append(Event.FromString(body))
+        data = data[16 + size :]
+    return found
+
+
+def scalars(folder: Path) -> list[tuple[str, float, int]]:
+    return [(v.tag, v.simple_value, e.step) for e in events(folder) for v in e.summary.value]
+
+
+def test_tensorboard_gets_every_finite_metric_of_every_generation(tmp_path):
     journal = log.Log(tmp_path, 0)
-    journal.append([{"generation": 1, "a": 0.5, "b": 2}, {"generation": 2, "a": 1.5, "b": 3}], 1, 1)
+    nan = float("nan")
+    journal.append([{"generation": 1, "a": 0.5, "b": 2}, {"generation": 2, "a": nan, "b": 3}], 1, 1)
+    folder = tmp_path / "tensorboard"
+    expected = [("a", 0.5, 1), ("b", 2.0, 1), ("b", 3.0, 2)]
+    assert scalars(folder) == expected  # at once, not when something is flushed
+    journal.append([{"generation": 3, "a": 1, "b": 4}], 1, 1)
     journal.close()
-    assert seen == [("a", 0.5, 1), ("b", 2, 1), ("a", 1.5, 2), ("b", 3, 2)]
-    assert len(list((tmp_path / "tensorboard").iterdir())) == 1
-    assert json.dumps(seen)  # plain numbers
+    assert scalars(folder) == [*expected, ("a", 1.0, 3), ("b", 4.0, 3)]
+    first, second, *_ = events(folder)
+    assert (first.file_version, second.step, second.session_log.status) == ("brain.Event:2", 1, 1)
+
+
+def test_events_of_a_resumed_run_void_those_that_come_again(written):
+    log.Log(written, 5)
+    assert events(written / "tensorboard")[1].step == 6
+
+
+def refuse(directory: Path, name: str) -> None:
+    """Let no file of this name be written, whoever the user is."""
+    path = directory / name
+    path.unlink(missing_ok=True)
+    path.mkdir()
+
+
+def test_without_room_for_events_training_goes_on(tmp_path):
+    (tmp_path / "tensorboard").write_text("a file")
+    with pytest.warns(UserWarning, match=r"events are not written: .*; training goes on"):
+        journal = log.Log(tmp_path, 0)
+    journal.append(rows(1, 3), 1.0, 1.0)
+    journal.close()
+    assert log.read(tmp_path / "metrics.csv")["generation"].tolist() == [1, 2, 3]
+
+
+def test_events_that_fail_later_are_dropped_with_one_warning(tmp_path):
+    journal = log.Log(tmp_path, 0)
+    refuse(tmp_path / "tensorboard", next((tmp_path / "tensorboard").iterdir()).name)
+    with pytest.warns(UserWarning, match=r"no longer written: .*events\.out.*; training goes on"):
+        journal.append(rows(1, 1), 1.0, 1.0)
+    journal.append(rows(2, 2), 1.0, 1.0)
+    assert log.read(tmp_path / "metrics.csv")["generation"].tolist() == [1, 2]
+
+
+def test_a_clock_that_cannot_be_written_stops_nothing(written):
+    journal = log.Log(written, 5, tensorboard=False)
+    refuse(written, "timing.csv")
+    more = [{"generation": 6, "score": 0.0, "nan": 0}, {"generation": 7, "score": 0.0, "nan": 0}]
+    with pytest.warns(UserWarning, match=r"timing\.csv is no longer written: .*; training goes on"):
+        journal.append(more[:1], 1.0, 1.0)
+    journal.append(more[1:], 1.0, 1.0)
+    journal.sync()
+    assert log.read(written / "metrics.csv")["generation"].tolist() == [1, 2, 3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"generation,seconds,generations_per_second\n3,1\xb1,3\n",
+        b"gener\xb1tion,seconds,generations_per_second\n3,1,3\n",
+        b"generation,minutes,generations_per_second\n3,1,3\n",
+        b"generation,seconds,generations_per_second\n3,1\n",
+        b"generation,seconds,generations_per_second\n3,nan,3\n",
+    ],
+)
+def test_a_damaged_clock_is_begun_anew(written, content):
+    (written / "timing.csv").write_bytes(content)
+    with pytest.warns(UserWarning, match=r"timing\.csv .*begun anew; .*no result is"):
+        journal = log.Log(written, 5, tensorboard=False)
+    assert journal.elapsed == 0.0
+    journal.append([{"generation": 6, "score": 0.0, "nan": 0}], 0.5, 2.0)
+    assert log.read(written / "timing.csv")["seconds"].tolist() == [2.0]
+
+
+def test_the_clock_goes_on(written):
+    assert log.Log(written, 5, tensorboard=False).elapsed == 1.5
+    assert log.Log(written, 4, tensorboard=False).elapsed == 1.0
+    assert log.Log(written, 0, tensorboard=False).elapsed == 0.0
+
+
+def test_rows_that_are_done_and_gone_are_an_error(written):
+    metrics = written / "metrics.csv"
+    whole = metrics.read_bytes()
+    for left in (None, b"", whole[: len(whole) // 2], whole.replace(b"\n5,", b"\nx,")):
+        metrics.write_bytes(left) if left is not None else metrics.unlink()
+        for action in (lambda: log.Log(written, 5), lambda: log.seal(written, 5)):
+            with pytest.raises(log.DamagedLog, match=r"metrics\.csv has no row of generation 5"):
+                action()
+    assert names(written) == ["metrics.csv", "timing.csv"]
+
+
+def test_a_seal_is_of_the_rows_up_to_its_generation(written):
+    lines = (written / "metrics.csv").read_bytes().splitlines(keepends=True)
+    for generation in (3, 5, 1, 5):
+        prefix = b"".join(lines[: generation + 1])
+        sha256 = hashlib.sha256(prefix).hexdigest()
+        found = log.seal(written, generation)
+        assert found == {"bytes": len(prefix), "sha256": sha256}
+        log.verify(written, json.loads(json.dumps(found)))
+    log.verify(written / "none", log.seal(written, 0))  # no row, so no file
+
+
+def test_a_seal_hashes_no_row_twice(written):
+    """What a process has sealed stays sealed, whatever happens to the file since."""
+    journal, metrics = log.Log(written, 5, tensorboard=False), written / "metrics.csv"
+    log.seal(written, 5)
+    journal.append([{"generation": 6, "score": 0.5, "nan": 0}], 0.5, 2.0)
+    whole = metrics.read_bytes()
+    metrics.write_bytes(whole.replace(b"\n2,", b"\n7,"))
+    sealed = log.seal(written, 6)
+    assert sealed == {"bytes": len(whole), "sha256": hashlib.sha256(whole).hexdigest()}
+    with pytest.raises(log.DamagedLog, match="was changed"):
+        log.verify(written, sealed)
+
+
+def test_a_table_that_was_cut_is_sealed_anew(written):
+    log.seal(written, 5)
+    journal = log.Log(written, 3, tensorboard=False)
+    journal.append([row | {"score": 0.5} for row in rows(4, 6)], 1.0, 2.0)
+    found = log.seal(written, 6)
+    assert found["sha256"] == hashlib.sha256((written / "metrics.csv").read_bytes()).hexdigest()
+
+
+def test_any_flipped_bit_before_the_seal_is_named(written):
+    metrics, sealed = written / "metrics.csv", log.seal(written, 4)
+    whole = metrics.read_bytes()
+    for position in range(len(whole)):
+        data = bytearray(whole)
+        data[position] ^= 1 << position % 8
+        metrics.write_bytes(data)
+        if position < sealed["bytes"]:
+            with pytest.raises(
+                log.DamagedLog, match=rf"metrics\.csv was changed: .*{sealed['bytes']} by"
+            ):
+                log.verify(written, sealed)
+        else:
+            log.verify(written, sealed)
+    metrics.write_bytes(whole[:50])
+    with pytest.raises(log.DamagedLog, match=r"metrics\.csv was cut: it has 50 of the \d+ bytes"):
+        log.verify(written, sealed)
+    metrics.unlink()
+    with pytest.raises(log.DamagedLog, match=r"cannot be read.*metrics\.csv.*restore it from"):
+        log.verify(written, sealed)
+
+
+@pytest.mark.parametrize(
+    "line", [b"6,0.25", b"6,x,0", b"6,0.25,\xb1", b"", b"6,0.25,0,1", b"\0,0,0"]
+)
+def test_a_table_that_is_none_names_its_line(written, line):
+    metrics = written / "metrics.csv"
+    with metrics.open("ab") as file:
+        file.write(line + b"\n")
+    with pytest.raises(log.DamagedLog, match=r"metrics\.csv is damaged: its line 7 is b'"):
+        log.read(metrics)
+
+
+def test_a_header_that_is_none_names_its_file(written):
+    metrics = written / "metrics.csv"
+    metrics.write_bytes(metrics.read_bytes().replace(b"score", b"sc\xb1re"))
+    for action in (log.read, log.last):
+        with pytest.raises(log.DamagedLog, match=r"metrics\.csv is damaged: 'utf-8' codec"):
+            action(metrics)
+
+
+def test_the_last_row_must_fit_the_header(written):
+    metrics = written / "metrics.csv"
+    metrics.write_bytes(metrics.read_bytes() + b"6,1\n")
+    with pytest.raises(log.DamagedLog, match=r"metrics\.csv is damaged: its last line has 2 col"):
+        log.last(metrics)
+
+
+def test_a_pipe_is_no_table_and_waits_for_nobody(tmp_path):
+    os.mkfifo(tmp_path / "metrics.csv")
+    for action in (log.read, log.last, lambda path: log.Log(path.parent, 0, tensorboard=False)):
+        with pytest.raises(OSError, match=r"no regular file.*metrics\.csv"):
+            action(tmp_path / "metrics.csv")
+
+
+@pytest.mark.parametrize("name", ["metrics.csv", ".metrics.csv.draft.csv", "timing.csv"])
+def test_nothing_is_written_through_a_link(written, name):
+    victim = written.parent / f"{written.name}-victim"
+    path = written / name
+    victim.write_bytes(path.read_bytes() if path.exists() else b"precious")
+    before = victim.read_bytes()
+    path.unlink(missing_ok=True)
+    path.symlink_to(victim)
+    journal = log.Log(written, 3, tensorboard=False)
+    journal.append(rows(4, 5), 1.0, 1.0)
+    assert victim.read_bytes() == before
+    assert log.read(written / "metrics.csv")["generation"].tolist() == [1, 2, 3, 4, 5]
+
+
+def test_a_copy_made_of_links_stays_as_it_was(written):
+    copy = written.parent / f"{written.name}-copy"
+    shutil.copytree(written, copy, copy_function=os.link)
+    before = (copy / "metrics.csv").read_bytes()
+    log.Log(written, 5, tensorboard=False).append([rows(5, 5)[0] | {"generation": 6}], 1.0, 1.0)
+    assert (copy / "metrics.csv").read_bytes() == before
+
+
+LIMITED = """
+import resource, sys, warnings
+from pathlib import Path
+from credo.runs import log
+directory, size = Path(sys.argv[1]), int(sys.argv[2])
+warnings.simplefilter("always")
+warnings.showwarning = lambda message, *_: print("warned:", message)
+journal = log.Log(directory, 0)
+resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+g = 0
+try:
+    while g < 2000:
+        journal.append([{"generation": g + i, "value": 0.5} for i in (1, 2, 3)], 1.0, 1.0)
+        g += 3
+except OSError as error:
+    print("error:", error)
+journal.close()
+print("done:", g)
+"""
+
+
+def test_where_no_file_may_grow_metrics_are_an_error_and_events_are_not(tmp_path):
+    """The kernel's own refusal. A thread of TensorBoard's writer would wait here for ever."""
+    command = [sys.executable, "-c", LIMITED, str(tmp_path), "4000"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    warned, *clock, error, last = done.stdout.splitlines()
+    assert warned.startswith("warned: TensorBoard events are no longer written: [Errno 27] File")
+    assert clock == []
+    assert "metrics.csv" in error
+    assert "ulimit -f" in error
+    assert "then resume; checkpoints are intact" in error
+    g = int(last.removeprefix("done: "))
+    assert 300 < g < 1000
+    assert log.read(tmp_path / "metrics.csv")["generation"].tolist() == list(range(1, g + 1))

@@ -19,8 +19,9 @@ from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team
 from credo.runner import Runner
 from credo.runs import checkpoint, config
+from credo.runs.config import ConfigError
 from credo.runs.export import export
-from credo.runs.loop import Policy, Run
+from credo.runs.loop import Policy, Run, RunError
 
 OBS, ACTIONS = 3, 2
 BOX = {"low": [-3.0, 10.0], "high": [1.0, 30.0], "shape": [2, 1], "dtype": "float32"}
@@ -162,13 +163,26 @@ def test_of_an_older_run_a_public_task_is_opened_for_its_units(tmp_path):
         np.testing.assert_allclose(ours(obs), 2.0 * raw(obs), rtol=1e-6)
 
 
-def test_of_an_older_run_somebodys_own_code_is_not_opened(tmp_path, monkeypatch):
-    env = Gymnasium("Pendulum-v1", in_process=True)
+def test_of_an_older_run_somebodys_own_code_is_opened_if_it_is_trusted(tmp_path):
+    env = Gymnasium("gymnasium.envs.classic_control:PendulumEnv", max_episode_steps=9)
     policy = MLP((4,)).init(3, 1, key=jax.random.key(0))
     run = recorded(tmp_path / "run", Neuroevolution(env, MLP((4,)), population_size=10), policy)
-    own = property(lambda self: "mine:Pendulum")
-    monkeypatch.setattr(Gymnasium, "foreign_code", own, raising=False)
-    with pytest.warns(UserWarning, match=r"the units of mine:Pendulum: actions lie in \[-1, 1\]"):
-        ours = run.policy()
-    raw = Policy(policy)
-    np.testing.assert_array_equal(ours(inputs()[0]), raw(inputs()[0]))
+    with pytest.raises(ConfigError, match=r"names gymnasium\.envs\.classic_control:Pendulum"):
+        run.policy()
+    ours = Run(run.path, trust=True).policy()
+    np.testing.assert_allclose(ours(inputs()[0]), 2.0 * Policy(policy)(inputs()[0]), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"actions": {"low": [0.0]}}, {"actions": [BOX]}, {"agents": 10**9}, {"obs_size": None}],
+    ids=str,
+)
+def test_a_record_that_makes_no_sense_names_its_file(tmp_path, wrong):
+    policy = MLP((4,)).init(OBS, ACTIONS, key=jax.random.key(0))
+    algorithm = Neuroevolution(SequenceRecall(depth=2), MLP((4,)), population_size=10)
+    run = recorded(tmp_path / "run", algorithm, policy, task=task(BOX) | wrong)
+    for use in (run.policy, lambda: export(run, tmp_path / "p.safetensors")):
+        with pytest.raises(RunError, match=r"config\.json is damaged: its task cannot be read"):
+            use()
+    assert not (tmp_path / "p.safetensors").exists()

@@ -1,4 +1,5 @@
 import errno
+import itertools
 import json
 import os
 import shutil
@@ -100,31 +101,72 @@ def test_a_part_is_a_file_that_the_formats_own_library_reads(tmp_path):
         assert found.tobytes() == expected[name][40:45].tobytes()
 
 
-def test_parts_are_written_once_and_shared(tmp_path):
-    first, second = (save(tmp_path, i, filled(n), {}) for i, n in enumerate((38, 47)))
-    assert ranges(first) == [(0, 10), (10, 20), (20, 30), (30, 38)]
-    assert ranges(second) == [(7, 10), (10, 20), (20, 30), (30, 40), (40, 47)]
-    old, new = ({p.name: p.stat() for p in parts(folder)} for folder in (first, second))
-    shared = old.keys() & new.keys()
-    assert sorted(name[8:20] for name in shared) == ["000000000010", "000000000020"]
-    for name in shared:
-        assert (old[name].st_ino, old[name].st_nlink) == (new[name].st_ino, 2)
-    third = save(tmp_path, 2, filled(47), {})  # nothing new
-    assert [p.stat().st_ino for p in parts(third)] == [p.stat().st_ino for p in parts(second)]
-    for generation, written in enumerate((38, 47, 47)):
-        assert_loads(tmp_path, filled(written), generation=generation)
+def inodes(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_ino for path in parts(folder)}
+
+
+def test_a_part_is_written_twice_and_shared_with_the_checkpoint_before_the_last(tmp_path):
+    written = (38, 47, 47, 48, 58)
+    folders = [save(tmp_path, g, filled(n), {}, keep=9) for g, n in enumerate(written)]
+    assert ranges(folders[0]) == [(0, 10), (10, 20), (20, 30), (30, 38)]
+    assert ranges(folders[1]) == [(7, 10), (10, 20), (20, 30), (30, 40), (40, 47)]
+    found = [inodes(folder) for folder in folders]
+    for before, after in itertools.pairwise(found):
+        assert not set(before.values()) & set(after.values())
+    for name in set(found[0]) & set(found[1]):
+        assert len({there[name] for there in found if name in there}) == 2
+        assert found[2][name] == found[0][name]
+    assert found[2].keys() == found[1].keys()
+    for generation, n in enumerate(written):
+        assert_loads(tmp_path, filled(n), generation=generation)
+
+
+def test_of_one_checkpoint_alone_a_part_is_written_once(tmp_path):
+    first = inodes(save(tmp_path, 1, filled(38), {}, keep=1))
+    second = inodes(save(tmp_path, 2, filled(39), {}, keep=1))
+    assert {name[8:20] for name in first.keys() & second.keys()} == {
+        f"{n:012d}" for n in (0, 10, 20)
+    }
+    assert all(first[name] == second[name] for name in first.keys() & second.keys())
 
 
 def test_a_part_goes_with_the_last_checkpoint_that_has_it(tmp_path):
-    for generation, written in enumerate((20, 35, 52, 69, 69)):
-        folder = save(tmp_path, generation, filled(written), {}, keep=2)
-    assert names(tmp_path) == ["00000003", "00000004"]
+    for generation, written in enumerate((20, 35, 52, 69, 69, 69)):
+        folder = save(tmp_path, generation, filled(written), {}, keep=3)
+    assert names(tmp_path) == ["00000003", "00000004", "00000005"]
     assert ranges(folder) == [(29, 30), (30, 40), (40, 50), (50, 60), (60, 69)]
     assert {path.stat().st_nlink for path in parts(folder)} == {2}
-    last = save(tmp_path, 5, filled(110), {}, keep=1)
-    assert names(tmp_path) == ["00000005"]
+    last = save(tmp_path, 6, filled(110), {}, keep=1)
+    assert names(tmp_path) == ["00000006"]
     assert {path.stat().st_nlink for path in parts(last)} == {1}
     assert_loads(tmp_path, filled(110))
+
+
+@pytest.mark.parametrize("keep", [2, 3])
+def test_no_damaged_part_spoils_all_checkpoints(tmp_path, keep):
+    for generation, written in enumerate((35, 38, 52, 52, 69, 72)):
+        save(tmp_path, generation, filled(written), {}, keep=keep)
+        for path in tmp_path.glob("*/replay*"):
+            whole, at = path.read_bytes(), os.stat(path).st_mtime_ns
+            flip_part(path)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DamagedCheckpoint)
+                if generation:
+                    load(tmp_path, like(filled(written)))
+            path.write_bytes(whole)
+            os.utime(path, ns=(at, at))
+    assert len(names(tmp_path)) == keep
+
+
+def test_without_room_for_a_second_copy_parts_are_shared(tmp_path, monkeypatch):
+    first = save(tmp_path, 1, filled(38), {})
+    usage = shutil.disk_usage(tmp_path)._replace(free=500)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+    with pytest.warns(UserWarning, match="too little room in .* for a second copy of the replay"):
+        second = save(tmp_path, 2, filled(39), {})
+    shared = inodes(first).items() & inodes(second).items()
+    assert len(shared) == 3
+    assert_loads(tmp_path, filled(39))
 
 
 def test_several_buffers(tmp_path):
@@ -270,15 +312,44 @@ def test_damage_to_a_part_is_named_and_the_one_before_used(tmp_path, harm):
 
 
 def test_damage_to_a_part_damages_all_that_share_it(tmp_path):
-    first, second = (save(tmp_path, i, filled(n), {}) for i, n in enumerate((35, 38)))
-    flip_part(parts(first)[1])
+    folders = [save(tmp_path, i, filled(n), {}, keep=9) for i, n in enumerate((35, 36, 37))]
+    flip_part(parts(folders[0])[1])
+    assert [damage(folder) is None for folder in folders] == [False, True, False]
+    flip_part(parts(folders[1])[1])
     with pytest.raises(CheckpointError, match="no intact checkpoint"):
         load(tmp_path, like(filled(38)))
     # A process that still has the rows writes them again, and this one is whole.
-    third = save(tmp_path, 2, filled(39), {})
-    assert [damage(folder) is None for folder in (first, second, third)] == [False, False, True]
-    assert parts(third)[0].stat().st_nlink == 3
+    fourth = save(tmp_path, 3, filled(39), {}, keep=9)
+    assert damage(fourth) is None
+    assert [path.stat().st_nlink for path in parts(fourth)] == [2, 1, 2, 1]
     assert_loads(tmp_path, filled(39))
+
+
+def test_without_its_buffer_a_state_is_loaded_however_damaged_the_buffer_is(tmp_path):
+    state = {"a": filled(35), "b": stacked()}
+    folder = save(tmp_path, 7, state, {"frames": 35})
+    flip_part(parts(folder)[1])
+    parts(folder)[2].unlink()
+    with pytest.raises(CheckpointError, match="no intact"):
+        load(tmp_path, like(state))
+    smaller = {"a": like(filled(35, 12)), "b": like(state["b"])}
+    for wanted in (like(state), smaller):
+        with pytest.warns(UserWarning, match="replay buffer of checkpoint .*00000007 is left out"):
+            found = load(tmp_path, wanted, without_replay=True)
+        empty = {
+            part: {
+                "buffer": jax.tree.map(
+                    lambda x: jnp.zeros(x.shape, x.dtype), wanted[part]["buffer"]
+                ),
+                "weights": state[part]["weights"],
+            }
+            for part in state
+        }
+        assert_same(found.state, empty)
+        assert (found.generation, found.counters) == (7, {"frames": 35})
+    flip(folder / "state.safetensors", -1)
+    with pytest.raises(CheckpointError, match=r"SHA-256 of state\.safetensors"):
+        load(tmp_path, like(state), without_replay=True)
 
 
 def test_any_flipped_bit_is_noticed(tmp_path):
@@ -292,11 +363,24 @@ def test_any_flipped_bit_is_noticed(tmp_path):
     assert damage(folder) is None
 
 
-def test_another_capacity_is_a_different_shape(tmp_path):
-    save(tmp_path, 1, filled(15), {})
-    message = r"\['obs'\]: found float32\[40, 3\], expected float32\[41, 3\]"
+@pytest.mark.parametrize(
+    ("written", "old", "new"), [(15, 40, 41), (15, 40, 15), (0, 9, 1), (9, 9, 40)]
+)
+def test_a_buffer_never_full_fits_another_capacity(tmp_path, written, old, new):
+    save(tmp_path, 1, filled(written, old), {})
+    found = load(tmp_path, like(filled(written, new)))
+    assert_same(found.state, filled(written, new))
+    # And what is saved then shares the files.
+    folders = [save(tmp_path, g, filled(written, new), {}, keep=9) for g in (2, 3)]
+    assert inodes(folders[1]) == inodes(tmp_path / "00000001")
+
+
+@pytest.mark.parametrize(("written", "old", "new"), [(41, 40, 41), (15, 40, 14), (50, 40, 60)])
+def test_another_capacity_that_would_lose_rows_is_a_different_shape(tmp_path, written, old, new):
+    save(tmp_path, 1, filled(written, old), {})
+    message = rf"\['obs'\]: found float32\[{old}, 3\], expected float32\[{new}, 3\]"
     with pytest.raises(CheckpointError, match=message):
-        load(tmp_path, like(filled(15, 41)))
+        load(tmp_path, like(filled(written, new)))
 
 
 def test_a_part_that_is_not_what_its_name_says(tmp_path):
@@ -399,9 +483,10 @@ def test_only_what_is_written_is_needed(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         usage = shutil.disk_usage(tmp_path)._replace(free=7)
         patch.setattr(shutil, "disk_usage", lambda path: usage)
-        message, _ = outcome(
-            lambda: save(tmp_path, 2, filled(39), {}), 3, OSError(errno.ENOSPC, "full")
-        )
+        with pytest.warns(UserWarning, match="too little room"):
+            message, _ = outcome(
+                lambda: save(tmp_path, 2, filled(39), {}), 3, OSError(errno.ENOSPC, "full")
+            )
     folder = save(tmp_path, 2, filled(39), {})
     fixed = sum((folder / name).stat().st_size for name in ("state.safetensors", "counters.json"))
     assert f"it needs {fixed + 9 * 21:,} bytes" in str(message)

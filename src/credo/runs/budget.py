@@ -99,6 +99,26 @@ class Budget:
                 )
 
 
+def fitted(algorithm: Any, budget: Budget) -> Any:
+    """`algorithm` with a replay buffer that is no larger than what `budget` can fill: as long as it
+    never wraps, its capacity changes no bit. What is recorded stays the user's number.
+
+    It needs `most_frames`, an upper bound of the frames of one generation.
+    """
+    capacity = getattr(algorithm, "replay_capacity", None)
+    most = getattr(algorithm, "most_frames", None)
+    if capacity is None or most is None:
+        return algorithm
+    bounds = [capacity]
+    if budget.generations is not None:
+        bounds.append(budget.generations * most)
+    if budget.frames is not None:
+        bounds.append(budget.frames - 1 + most)  # the last generation begins before the limit
+    # Budgets of about the same size share their programs.
+    rows = min(capacity, 1 << (max(1, min(bounds)) - 1).bit_length())
+    return dataclasses.replace(algorithm, replay_capacity=rows)
+
+
 def short(number: float) -> str:
     """1234567 as `1.23M`."""
     for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):

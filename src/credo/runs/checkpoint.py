@@ -6,7 +6,7 @@ A checkpoint is a folder named by its generation:
       state.safetensors   every array leaf, named by its path in the tree
       counters.json       plain numbers and strings
       replay0-….safetensors, …   rows of a replay buffer; unchanged ones are hard links
-      COMMIT              size and SHA-256 of each; written last
+      COMMIT              size and SHA-256 of each, and the caller's seals; written last
 
 It is written under another name and renamed when it is on the disk, so a process may be killed at
 any moment. Nothing read here can execute code. `export_policy` and `import_policy` do the same
@@ -14,7 +14,6 @@ for one file.
 """
 
 import contextlib
-import errno
 import functools
 import hashlib
 import json
@@ -22,7 +21,7 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,7 @@ from jax.tree_util import keystr, tree_flatten_with_path
 from jaxtyping import Array, PyTree
 from safetensors import SafetensorError, safe_open
 
-from . import segments
+from . import files, segments
 
 STATE, COUNTERS, COMMIT = "state.safetensors", "counters.json", "COMMIT"
 # Our entries in a file's metadata.
@@ -74,24 +73,34 @@ class Checkpoint(eqx.Module):
     state: PyTree
     counters: dict[str, Any]
     path: Path
+    seals: dict[str, Any]
 
 
 def save(
-    directory: Path, generation: int, state: PyTree, counters: dict[str, Any], *, keep: int = 3
+    directory: Path,
+    generation: int,
+    state: PyTree,
+    counters: dict[str, Any],
+    *,
+    keep: int = 3,
+    seals: Mapping[str, Any] = {},
 ) -> Path:
     """Write `state` and `counters` as the checkpoint of `generation`; returns its folder.
 
     Array leaves (JAX or NumPy, typed PRNG keys too) are kept bit for bit. All other leaves are
     not written: `load` takes them from its `like`. `counters` holds numbers, strings, lists and
-    dicts; integers of any size and floats come back exactly.
+    dicts; integers of any size and floats come back exactly. So do `seals`, which say what the
+    checkpoint belongs to, hashes of other files say: `load` hands them to its `check`.
 
-    The rows of a `credo.replay.Replay` that an older checkpoint has are not written again but
-    linked (see `segments`).
+    The rows of a `credo.replay.Replay` that older checkpoints have are not written again but
+    linked (see `segments`), if there is a copy besides that of the checkpoint just before: two in
+    a row share no file, so that no damaged file spoils both. To have `keep=2` or more therefore
+    takes the room of two buffers; where that is not free, files are shared, with a warning.
 
     Of the older checkpoints the newest intact ones stay, `keep` with this one, and the rest are
     removed once this one is safe; to know them, those that stay are read once, without the rows
     that this process wrote or read before. An intact checkpoint of the same generation is left
-    alone, a damaged one replaced.
+    alone but for its seals, a damaged one replaced. What cannot be removed is a warning.
 
     Raises `CheckpointError` if a leaf cannot be stored or the disk is full or fails; older
     checkpoints are then intact and no half-written one is left.
@@ -108,28 +117,42 @@ def save(
         del leaves[name]  # it goes to files of its own
     metadata = {KEYS: json.dumps(keys)} | ({REPLAY: segments.describe(rings)} if rings else {})
     header = _header(leaves, metadata)
-    text = _counters_text(counters)
+    text, seals = _plain_text("counters", counters), dict(seals)
+    _plain_text("seals", seals)
     parts = segments.parts(rings)
-    with _explained(f"cannot read {directory}", directory):
-        there = _intact_parts(directory, parts)
     needed = len(header) + _size(leaves) + len(text)
-    needed += sum(_size(rows) for name, rows in parts.items() if name not in there)
-    with _explained(f"cannot save checkpoint {folder}", directory, needed):
+    with _explained(f"cannot read {directory}", directory):
+        there, more = _linkable(folder, parts, needed, keep)
+    with _explained(f"cannot save checkpoint {folder}", directory, needed + more):
         directory.mkdir(parents=True, exist_ok=True)
         _remove_unfinished(directory)
         if not folder.exists() or damage(folder, reread=False):
-            _write_folder(folder, _chunks(header, leaves), text, parts, there)
-    with _explained(f"{folder} is saved, but an older checkpoint cannot be removed", directory):
-        _remove_beyond(keep, folder)
+            _write_folder(folder, _chunks(header, leaves), text, parts, there, seals)
+        elif (commit := _commit(folder)).get("seals", {}) != seals:
+            text = _commit_text(generation, commit["files"], seals)
+            files.write_whole(folder / COMMIT, [text])
+    _remove_beyond(keep, folder)
     return folder
 
 
-def load(directory: Path, like: PyTree, *, generation: int | None = None) -> Checkpoint:
+def load(
+    directory: Path,
+    like: PyTree,
+    *,
+    generation: int | None = None,
+    without_replay: bool = False,
+    check: Callable[[int, dict[str, Any]], str | None] | None = None,
+) -> Checkpoint:
     """The newest intact checkpoint in `directory`, or the one of `generation`.
 
     `like` gives the structure: arrays or `jax.ShapeDtypeStruct`s where the checkpoint has arrays,
     e.g. `eqx.filter_eval_shape(algorithm.init, key=key)`; every other leaf is returned as it is.
-    Arrays come back as JAX arrays of the same dtype and bits (never weakly typed).
+    Arrays come back as JAX arrays of the same dtype and bits (never weakly typed). A replay buffer
+    may have another capacity in `like` if it was never full, and all its rows fit.
+
+    - `without_replay`: replay buffers come back empty, with a warning; their files may be damaged.
+    - `check(generation, seals)`: what is wrong with a checkpoint of these seals, None if nothing
+      is; such a checkpoint counts as damaged. Written without `seals` it has `{}`.
 
     Each damaged checkpoint newer than the one used is named in a `DamagedCheckpoint` warning.
     Raises `CheckpointError` if there is none, if all are damaged, if the one of `generation` is,
@@ -145,21 +168,13 @@ def load(directory: Path, like: PyTree, *, generation: int | None = None) -> Che
         raise CheckpointError(f"{which} in {directory}: there is {there}")
     damaged = {}
     for folder in folders:
-        if reason := damage(folder):
-            damaged[folder.name] = reason
-            continue
-        for name, why in damaged.items():
-            warnings.warn(
-                f"checkpoint {directory / name} is damaged ({why}): using {folder.name} instead",
-                DamagedCheckpoint,
-                stacklevel=2,
-            )
-        metadata, arrays = _read(folder / STATE)
-        with _explained(f"cannot read {folder}", folder):
-            arrays |= segments.stored(folder, metadata.get(REPLAY, "[]"))
-            state = _fit(folder / STATE, like, arrays, metadata)
-            counters = json.loads((folder / COUNTERS).read_text())
-        return Checkpoint(int(folder.name), state, counters, folder)
+        reason = damage(folder, replay=not without_replay)
+        if reason is None and check is not None:
+            reason = check(int(folder.name), _commit(folder).get("seals", {}))
+        if reason is None:
+            _warn_of(damaged, folder, without_replay)
+            return _loaded(folder, like, without_replay)
+        damaged[folder.name] = reason
     reasons = "".join(f"\n  {name}: {why}" for name, why in damaged.items())
     raise CheckpointError(
         f"no intact checkpoint in {directory}:{reasons}\n"
@@ -167,11 +182,37 @@ def load(directory: Path, like: PyTree, *, generation: int | None = None) -> Che
     )
 
 
-def damage(folder: Path, *, reread: bool = True) -> str | None:
+def _warn_of(damaged: Mapping[str, str], used: Path, without_replay: bool) -> None:
+    for name, why in damaged.items():
+        warnings.warn(
+            f"checkpoint {used.with_name(name)} is damaged ({why}): using {used.name} instead",
+            DamagedCheckpoint,
+            stacklevel=3,
+        )
+    if without_replay:
+        warnings.warn(
+            f"the replay buffer of checkpoint {used} is left out: it is empty and fills again, so "
+            "results will differ from those of a run that has it",
+            stacklevel=3,
+        )
+
+
+def _loaded(folder: Path, like: PyTree, without_replay: bool) -> Checkpoint:
+    metadata, arrays = _read(folder / STATE)
+    empty = segments.names(like) if without_replay else set()
+    with _explained(f"cannot read {folder}", folder):
+        arrays |= segments.stored(folder, metadata.get(REPLAY, "[]"))
+        state = _fit(folder / STATE, like, arrays, metadata, empty)
+        counters = json.loads(files.read_bytes(folder / COUNTERS))
+        seals = _commit(folder).get("seals", {})
+    return Checkpoint(int(folder.name), state, counters, folder, seals)
+
+
+def damage(folder: Path, *, reread: bool = True, replay: bool = True) -> str | None:
     """What is wrong with the checkpoint in `folder`; None if every byte is as it was written.
 
     Without `reread`, rows of a replay buffer that this process wrote or read before are taken to
-    be as they were if their file was not touched since.
+    be as they were if their file was not touched since; without `replay` they are not looked at.
     """
     try:
         names = set(os.listdir(folder))
@@ -181,15 +222,21 @@ def damage(folder: Path, *, reread: bool = True) -> str | None:
             return f"it has no {COMMIT}: writing it was never finished"
         if missing := {STATE, COUNTERS} - names:
             return f"{' and '.join(sorted(missing))} is missing"
-        committed = (folder / COMMIT).read_bytes()
-        found = {name: _fingerprint(folder / name) for name in (STATE, COUNTERS)}
+        committed = files.read_bytes(folder / COMMIT)
+        commit = _parsed(committed)
+        found = {name: _looked_at(folder / name, commit) for name in (STATE, COUNTERS)}
+        if not replay:
+            names = set()
+            found |= {
+                name: f for name, f in commit["files"].items() if segments.NAME.fullmatch(name)
+            }
         for name in filter(segments.NAME.fullmatch, names):
-            found[name] = _part_fingerprint(folder / name, reread=reread)
-    except OSError as error:
+            found[name] = _looked_at(folder / name, commit, reread=reread)
+    except (OSError, ValueError) as error:
         return f"it cannot be read: {error}"
-    if committed == _commit_text(int(folder.name), found):
+    if committed == _commit_text(int(folder.name), found, commit["seals"]):
         return None
-    return _difference(committed, found)
+    return _difference(commit["files"], found)
 
 
 def export_policy(path: Path, tree: PyTree, metadata: Mapping[str, str] | None = None) -> None:
@@ -211,15 +258,8 @@ def export_policy(path: Path, tree: PyTree, metadata: Mapping[str, str] | None =
     metadata[KEYS] = json.dumps(keys)
     header = _header(leaves, metadata | {CHECKSUM: _checksum(metadata, leaves)})
     needed = len(header) + _size(leaves)
-    partial = path.with_name(f".{path.name}.partial")
     with _explained(f"cannot write {path}", path.parent, needed):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            _write(partial, _chunks(header, leaves))
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
-        _sync(path.parent)
+        files.write_whole(path, _chunks(header, leaves))
 
 
 def import_policy(path: Path, like: PyTree) -> PyTree:
@@ -279,11 +319,19 @@ def _fit(
     like: PyTree,
     arrays: dict[str, np.ndarray | segments.Stored],
     metadata: Mapping[str, str],
+    empty: Collection[str] = (),
 ) -> PyTree:
-    """`like` with the arrays of the file in the places of its own; `arrays` is emptied."""
+    """`like` with the arrays of the file in the places of its own, and zeros in those that are to
+    be `empty`; `arrays` is emptied."""
     keys = json.loads(metadata[KEYS])
     paths, structure = tree_flatten_with_path(like)
-    expected = {keystr(at): _describe(leaf) for at, leaf in paths if _is_array(leaf)}
+    wanted = {keystr(at): leaf for at, leaf in paths if _is_array(leaf)}
+    expected = {name: _describe(leaf) for name, leaf in wanted.items() if name not in empty}
+    for name in empty:
+        arrays.pop(name, None)
+    for name, data in arrays.items():
+        if isinstance(data, segments.Stored) and name in wanted:
+            arrays[name] = data.fitted(wanted[name].shape)
     found = {}
     for name, data in arrays.items():
         wrap = functools.partial(jax.random.wrap_key_data, impl=keys.get(name))
@@ -291,6 +339,8 @@ def _fit(
     _check_same(path, expected, found)
 
     def leaf(name: str) -> Array:
+        if name in empty:
+            return jnp.zeros(wanted[name].shape, wanted[name].dtype)
         data = arrays.pop(name)
         # One leaf at a time: a buffer may fill most of the memory.
         array = jnp.array(_read_rows(data) if isinstance(data, segments.Stored) else data)
@@ -357,12 +407,12 @@ def _checksum(metadata: Mapping[str, str], leaves: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def _counters_text(counters: dict[str, Any]) -> bytes:
-    text = json.dumps(counters, indent=2)
+def _plain_text(what: str, values: dict[str, Any]) -> bytes:
+    text = json.dumps(values, indent=2)
     # Python's text of a float is exact, and its comparison by text also holds for NaN.
-    if repr(json.loads(text)) != repr(counters):
+    if repr(json.loads(text)) != repr(values):
         raise ValueError(
-            f"counters {counters!r} would come back as {json.loads(text)!r}: use Python numbers, "
+            f"{what} {values!r} would come back as {json.loads(text)!r}: use Python numbers, "
             "strings, lists, and dicts whose names are strings"
         )
     return text.encode()
@@ -371,12 +421,11 @@ def _counters_text(counters: dict[str, Any]) -> bytes:
 def _read(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
     """The metadata and the arrays of a file."""
     try:
-        with (
-            _explained(f"cannot read {path}", path.parent),
-            safe_open(path, framework="numpy") as file,
-        ):
-            metadata = file.metadata() or {}
-            return metadata, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        with _explained(f"cannot read {path}", path.parent):
+            os.close(files.opened(path, os.O_RDONLY, follow=True))  # the library waits for a pipe
+            with safe_open(path, framework="numpy") as file:
+                metadata, names = file.metadata() or {}, file.keys()
+                return metadata, {name: file.get_tensor(name) for name in names}
     except SafetensorError as error:
         raise CheckpointError(f"{path} is damaged: {error}") from error
 
@@ -417,25 +466,44 @@ def _remove_unfinished(directory: Path) -> None:
     """What killed processes left."""
     for path in directory.iterdir():
         if re.fullmatch(r"\.\d{8,}\.(partial|removed)", path.name):
-            shutil.rmtree(path)
+            with _spared(path):
+                files.remove(path)
 
 
 def _remove(folder: Path) -> None:
     # Under another name first: killed half-way, it must not look like a damaged checkpoint.
     removed = _beside(folder, "removed")
+    files.remove(removed)
     os.rename(folder, removed)
-    shutil.rmtree(removed)
+    with _spared(removed):
+        files.remove(removed)
 
 
 def _remove_beyond(keep: int, newest: Path) -> None:
     """Keep the `keep` newest intact checkpoints up to `newest`; later ones are not touched."""
-    older = [path for path in _checkpoints(newest.parent) if int(path.name) < int(newest.name)]
+    older = _older(newest)
     intact = 1
     for folder in older if len(older) >= keep else []:
         if intact == keep:
-            _remove(folder)
+            with _spared(folder):
+                _remove(folder)
         elif damage(folder, reread=False) is None:
             intact += 1
+
+
+def _older(folder: Path) -> list[Path]:
+    """Checkpoints before that in `folder`, newest first."""
+    every = _checkpoints(folder.parent)
+    return [path for path in every if int(path.name) < int(folder.name)]
+
+
+@contextlib.contextmanager
+def _spared(path: Path) -> Iterator[None]:
+    """What is left in the folder takes room and does no other harm."""
+    try:
+        yield
+    except OSError as error:
+        warnings.warn(f"cannot remove {path}: {error}; remove it yourself", stacklevel=4)
 
 
 def _write_folder(
@@ -444,6 +512,7 @@ def _write_folder(
     counters: bytes,
     parts: Mapping[str, Mapping[str, segments.Rows]],
     there: Mapping[str, Path],
+    seals: Mapping[str, Any],
 ) -> None:
     """`parts` are the files of replay buffers, and `there` says which of them are written."""
     partial = _beside(folder, "partial")
@@ -457,14 +526,15 @@ def _write_folder(
             if not (name in there and _link(there[name], partial / name)):
                 _write_part(partial / name, rows)
             found[name] = _part_fingerprint(partial / name, reread=False)
-        _write(partial / COMMIT, [_commit_text(int(folder.name), found)])
-        _sync(partial)
-        if folder.exists():
+        _write(partial / COMMIT, [_commit_text(int(folder.name), found, seals)])
+        files.sync(partial)
+        if os.path.lexists(folder):
             _remove(folder)
         os.rename(partial, folder)
-        _sync(folder.parent)
+        files.sync(folder.parent)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        with contextlib.suppress(OSError):  # the first error counts
+            files.remove(partial)
 
 
 # Files of a replay buffer's rows. They are never changed, so one look at each is enough.
@@ -502,69 +572,123 @@ def _link(old: Path, new: Path) -> bool:
     return True
 
 
-def _intact_parts(directory: Path, names: Iterable[str]) -> dict[str, Path]:
-    """Where in the checkpoints in `directory` files of these names are, as they were written."""
+def _linkable(
+    folder: Path, parts: Mapping[str, Mapping[str, segments.Rows]], needed: int, keep: int
+) -> tuple[dict[str, Path], int]:
+    """Where files of these parts are that the checkpoint in `folder` may share, and how many bytes
+    the others take, besides the `needed` ones."""
+
+    def size(there: Mapping[str, Path]) -> int:
+        return sum(_size(rows) for name, rows in parts.items() if name not in there)
+
+    before = next(iter(_older(folder)), None)
+    anywhere = _intact_parts(folder.parent, parts, None)
+    apart = _intact_parts(folder.parent, parts, before) if keep > 1 and before else anywhere
+    # A checkpoint that takes more than half of what is free would leave too little for the next.
+    enough = 2 * (needed + size(apart))
+    if size(apart) == size(anywhere) or shutil.disk_usage(folder.parent).free > enough:
+        return apart, size(apart)
+    warnings.warn(
+        f"there is too little room in {folder.parent} for a second copy of the replay buffer: "
+        "checkpoints share its files, and damage to one may be damage to all",
+        stacklevel=3,
+    )
+    return anywhere, size(anywhere)
+
+
+def _intact_parts(directory: Path, names: Iterable[str], but: Path | None) -> dict[str, Path]:
+    """Where in the checkpoints in `directory` files of these names are, as they were written;
+    none that the checkpoint `but` has, be it under another name."""
     wanted, there = set(names), {}
+    taken = set() if but is None else _files_in(but)
     for folder in _checkpoints(directory) if wanted else []:
         try:
-            files = json.loads((folder / COMMIT).read_bytes())["files"]
-            for name in wanted.intersection(files).difference(there):
-                if _part_fingerprint(folder / name, reread=False) == files[name]:
-                    there[name] = folder / name
+            written = _commit(folder)["files"]
+            for name in wanted.intersection(written).difference(there):
+                path = folder / name
+                if _identity(path)[:2] in taken:
+                    continue
+                if _part_fingerprint(path, reread=False) == written[name]:
+                    there[name] = path
         except (OSError, ValueError, KeyError, TypeError):
             continue  # damaged: what only it has is written again
     return there
 
 
+def _files_in(folder: Path) -> set[tuple[int, ...]]:
+    with contextlib.suppress(OSError):
+        return {_identity(folder / name)[:2] for name in os.listdir(folder)}
+    return set()
+
+
 def _write(path: Path, chunks: Iterable[bytes | memoryview]) -> dict[str, Any]:
     """Write `chunks` to the disk; returns the file's fingerprint."""
     digest, size = hashlib.sha256(), 0
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
-    try:
+
+    def hashed() -> Iterator[bytes | memoryview]:
+        nonlocal size
         for chunk in chunks:
             digest.update(chunk)
             size += len(chunk)
-            rest = memoryview(chunk)
-            while rest:
-                rest = rest[os.write(descriptor, rest) :]
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+            yield chunk
+
+    files.write_new(path, hashed())
     return {"bytes": size, "sha256": digest.hexdigest()}
 
 
-def _sync(directory: Path) -> None:
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def _fingerprint(path: Path) -> dict[str, Any]:
-    with open(path, "rb") as file:
+    with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
         return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), "bytes": file.tell()}
 
 
-def _commit_text(generation: int, files: dict[str, dict[str, Any]]) -> bytes:
-    commit = {"generation": generation, "files": files}
+def _looked_at(path: Path, commit: Mapping[str, Any], *, reread: bool = True) -> dict[str, Any]:
+    """The fingerprint of a file; of one that has another size than it should, only that."""
+    size = os.stat(path).st_size
+    should = commit["files"].get(path.name)
+    if should is not None and size != should["bytes"]:
+        return {"sha256": None, "bytes": size}
+    part = segments.NAME.fullmatch(path.name)
+    return _part_fingerprint(path, reread=reread) if part else _fingerprint(path)
+
+
+def _commit(folder: Path) -> dict[str, Any]:
+    """What COMMIT says. Raises `OSError` and `ValueError`."""
+    return _parsed(files.read_bytes(folder / COMMIT))
+
+
+def _parsed(committed: bytes) -> dict[str, Any]:
+    """The same of its text, `seals` and all; of no files if it does not say as we do."""
+    try:
+        commit = json.loads(committed)
+        found = {
+            str(name): {k: f[k] for k in ("bytes", "sha256")} for name, f in commit["files"].items()
+        }
+        return {"files": found, "seals": dict(commit.get("seals", {}))}
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return {"files": {}, "seals": {}}
+
+
+def _commit_text(
+    generation: int, files: Mapping[str, dict[str, Any]], seals: Mapping[str, Any] = {}
+) -> bytes:
+    commit: dict[str, Any] = {"generation": generation, "files": files}
+    if seals:
+        text = json.dumps(seals, sort_keys=True)
+        commit |= {"seals": seals, "sha256 of seals": hashlib.sha256(text.encode()).hexdigest()}
     return json.dumps(commit, indent=2, sort_keys=True).encode()
 
 
-def _difference(committed: bytes, found: dict[str, dict[str, Any]]) -> str:
+def _difference(then: Mapping[str, Any], found: Mapping[str, dict[str, Any]]) -> str:
     """Which file is not as COMMIT says."""
-    try:
-        files = json.loads(committed)["files"]
-        if missing := set(files).difference(found):
-            return f"{' and '.join(sorted(missing))} is missing"
-        for name, now in found.items():
-            then = files[name]
-            if now["bytes"] != then["bytes"]:
-                return f"{name} has {now['bytes']} bytes, {COMMIT} says {then['bytes']}"
-            if now["sha256"] != then["sha256"]:
-                return f"the SHA-256 of {name} is not the one in {COMMIT}"
-    except (ValueError, KeyError, TypeError):
-        pass
+    if missing := set(then).difference(found):
+        return f"{' and '.join(sorted(missing))} is missing"
+    for name, now in found.items() if then else ():
+        if name not in then:
+            break
+        if now["bytes"] != then[name]["bytes"]:
+            return f"{name} has {now['bytes']} bytes, {COMMIT} says {then[name]['bytes']}"
+        if now["sha256"] != then[name]["sha256"]:
+            return f"the SHA-256 of {name} is not the one in {COMMIT}"
     return f"{COMMIT} is not as it was written"
 
 
@@ -575,11 +699,13 @@ def _explained(task: str, directory: Path, needed: int = 0) -> Iterator[None]:
         yield
     except OSError as error:
         message = f"{task}: {error}"
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if error.errno in files.FULL:
             there = directory.absolute()
             there = next(path for path in (there, *there.parents) if path.exists())
+            advice = files.advice(error)
             message += (
                 f"; it needs {needed:,} bytes, and {shutil.disk_usage(there).free:,} are free in "
-                f"{there}. Free some space, then resume; older checkpoints are intact."
+                f"{there}. {advice[0].upper()}{advice[1:]}, then resume; older checkpoints are "
+                "intact."
             )
         raise CheckpointError(message) from error

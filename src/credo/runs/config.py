@@ -2,26 +2,33 @@
 
 Reading builds `equinox.Module` objects from their fields. A class is looked up by name: in Credo
 itself, or, for an environment, network or operator of your own, in a module of yours, which is
-imported. Nothing that is stored in a run is executed, but a config can name a module on your path:
-look into a stranger's config.json before you resume it.
+imported. To import is to execute, so what is read from a record of unknown origin is Credo's own
+alone (`trust=False`).
 """
 
 import dataclasses
 import difflib
+import functools
 import importlib
 import importlib.metadata
 import inspect
 import os
 import pathlib
 import platform
+import re
 import sys
+import types
+import typing
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
 import jax
+import jaxtyping
 import numpy as np
 
 from ..environments.base import AbstractEnvironment
+from ..environments.foreign import AbstractForeignEnvironment
 from ..environments.host import AbstractHostEnvironment
 from ..evolution.crossover import AbstractCrossover
 from ..evolution.mutation import AbstractMutation
@@ -52,6 +59,10 @@ class ConfigError(ValueError):
     """A config that cannot be read or built; the message says what to do."""
 
 
+class NotFound(ConfigError):
+    """A class that a record names cannot be imported from here."""
+
+
 def to_tree(value: Any) -> Any:
     """An object tree as plain JSON values. Floats keep every bit."""
     if isinstance(value, eqx.Module):
@@ -62,7 +73,7 @@ def to_tree(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [to_tree(v) for v in value]
     if isinstance(value, np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0:
-        return np.asarray(value).item()
+        value = np.asarray(value).item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
     raise ConfigError(
@@ -71,49 +82,156 @@ def to_tree(value: Any) -> Any:
     )
 
 
-def from_tree(tree: Any) -> Any:
-    """The object that `to_tree` recorded."""
+def from_tree(tree: Any, *, trust: bool = True, source: str = "this record") -> Any:
+    """The object that `to_tree` recorded.
+
+    **Arguments:** `trust`: whether classes and environments of somebody's own may be imported, as
+    in a record of this user. Without it a record that names any is refused before that.
+    `source`: whose record it is, for messages.
+
+    **Raises:** `ConfigError`, or what a class says about the values it is given.
+    """
+    foreign = [] if trust else [name for name in class_names(tree) if not _OWN.fullmatch(name)]
+    if foreign:
+        raise ConfigError(_untrusted(source, foreign[0]))
+
+    def build(tree: Any, at: str) -> Any:
+        if isinstance(tree, list):
+            return tuple(build(v, f"{at}.{i}") for i, v in enumerate(tree))
+        if not isinstance(tree, dict):
+            return tree
+        fields = {k: build(v, f"{at}.{k}") for k, v in tree.items() if k != "class"}
+        if "class" not in tree:
+            return fields
+        made = _made(find_class(tree["class"]), fields, at.lstrip("."))
+        named = None if trust else _foreign_code(made)
+        if named is not None:  # before anything is made of it, which may open it
+            raise ConfigError(_untrusted(source, named))
+        return made
+
+    return build(tree, "")
+
+
+def _untrusted(source: str, named: str) -> str:
+    return (
+        f"{source} was not made here and names {named}, which is somebody's own code: look into "
+        "config.json, then give --trust (from Python Run(path, trust=True))"
+    )
+
+
+_OWN = re.compile(r"credo\.(environments|networks|evolution|learners|algorithms)\.\w+:\w+")
+
+
+def class_names(tree: Any) -> Iterator[str]:
+    """The names of all classes in a record."""
+    if isinstance(tree, dict):
+        if "class" in tree:
+            yield str(tree["class"])
+        tree = list(tree.values())
     if isinstance(tree, list):
-        return tuple(from_tree(v) for v in tree)
-    if not isinstance(tree, dict):
-        return tree
-    if "class" not in tree:
-        return {k: from_tree(v) for k, v in tree.items()}
-    cls = find_class(tree["class"])
-    fields = {k: from_tree(v) for k, v in tree.items() if k != "class"}
-    known = [f.name for f in dataclasses.fields(cls)]
-    for name in fields:
-        if name not in known:
+        for value in tree:
+            yield from class_names(value)
+
+
+def _foreign_code(env: Any) -> str | None:
+    """The code of somebody's own that opening this environment would import."""
+    if not isinstance(env, AbstractForeignEnvironment):
+        return None
+    if hasattr(type(env), "foreign_code"):
+        return env.foreign_code  # pyright: ignore[reportAttributeAccessIssue]
+    registered = env.api == "gymnasium" and re.fullmatch(r"[\w/-]+", env.id)
+    return None if registered else env.id
+
+
+def _made(cls: type, fields: dict[str, Any], at: str) -> Any:
+    """An object of `cls`, whose fields are what its annotations say."""
+    known = {f.name: f for f in dataclasses.fields(cls)}
+    name, kinds = f"{cls.__module__}:{cls.__name__}", _kinds(cls)
+    for key, value in fields.items():
+        if key not in known:
             raise ConfigError(
-                f"{tree['class']} has no field {name!r}{suggestion(name, known)}: was this run "
+                f"{name} has no field {key!r}{suggestion(key, list(known))}: was this run "
                 "made by another version of Credo?"
             )
-    return cls(**fields)
+        if key in kinds and value is not known[key].default and not _fits(value, kinds[key]):
+            kind = inspect.formatannotation(kinds[key]).replace("credo.", "")
+            where = f"{at}.{key}".lstrip(".")
+            raise ConfigError(f"{where} of {name} is {value!r}: it must be {kind}")
+    try:
+        return cls(**fields)
+    except (TypeError, AttributeError, LookupError, ArithmeticError) as error:
+        raise ConfigError(
+            f"{name} cannot be made of what is recorded ({type(error).__name__}: {error})"
+        ) from error
+
+
+@functools.cache
+def _kinds(cls: type) -> dict[str, Any]:
+    """The annotations of a class; of one whose annotations cannot be read, none."""
+    try:
+        return typing.get_type_hints(cls)
+    except Exception:  # a name that its module knows for type checkers alone
+        return {}
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a value may stand where `kind` is annotated. What JSON cannot tell apart passes."""
+    origin, inside = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, one) for one in inside)
+    if origin is tuple:
+        if not isinstance(value, tuple) or inside[-1:] == (...,):
+            return isinstance(value, tuple) and all(_fits(v, inside[0]) for v in value)
+        return len(value) == len(inside) and all(map(_fits, value, inside))
+    if origin is typing.Literal:
+        return value in inside
+    if kind in (None, type(None)):
+        return value is None
+    if kind is bool or kind is str or kind is dict or origin is dict:
+        return isinstance(value, origin or kind)
+    if inspect.isclass(kind) and issubclass(kind, int | float | jaxtyping.AbstractArray):
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if inspect.isclass(kind) and issubclass(kind, eqx.Module):
+        return isinstance(value, kind)
+    return True
 
 
 def class_name(cls: type) -> str:
-    """`package.module:Class`, by which `find_class` finds it again."""
+    """`package.module:Class`, by which `find_class` finds it again; `__main__:Class` of one that
+    was defined at a prompt or in a notebook, for this process alone."""
     module = cls.__module__
     if module == "__main__":  # a script: its file has a name under which it can be imported
         file = getattr(sys.modules["__main__"], "__file__", None)
-        if file is None:
-            raise ConfigError(
-                f"{cls.__name__} was defined at a prompt: put it into a file, or its runs could "
-                "not be resumed"
-            )
-        module = pathlib.Path(file).stem
+        module = module if file is None else pathlib.Path(file).stem
     if "." in cls.__qualname__:
         raise ConfigError(f"{cls.__qualname__} is defined inside something: move it to the module")
     return f"{module}:{cls.__name__}"
 
 
+def of_a_prompt(tree: Any) -> list[str]:
+    """The classes in a record that no other process can find."""
+    if isinstance(tree, dict | list):
+        values = tree.values() if isinstance(tree, dict) else tree
+        return [name for value in values for name in of_a_prompt(value)]
+    session = isinstance(tree, str) and tree.startswith("__main__:")
+    file = getattr(sys.modules.get("__main__"), "__file__", None)
+    return [tree.partition(":")[2]] if session and file is None else []
+
+
 def find_class(name: str) -> type:
     """The Module class `package.module:Class`."""
+    if not isinstance(name, str):
+        raise ConfigError(f"a class is named {name!r}: it must be package.module:Class")
     module, _, attribute = name.partition(":")
     try:
         cls = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(
+    except (ImportError, AttributeError, ValueError) as error:
+        if module == "__main__":
+            raise ConfigError(
+                f"{attribute} was defined at a prompt or in a notebook and is known in that "
+                "session alone: put it into a file of its own, and import it from there"
+            ) from error
+        raise NotFound(
             f"cannot find {name!r} ({error}): install its package, or start Python where its "
             "file lies"
         ) from error
@@ -145,8 +263,58 @@ def differences(a: Any, b: Any, path: str = "") -> list[str]:
 
 def changed(recorded: Any, today: Any) -> list[str]:
     """Where the tree of an object that was recorded differs from today's tree of one. A field that
-    came after the record has its default. Raises `ConfigError` if there is no such object today."""
-    return differences(to_tree(from_tree(recorded)), today)
+    came after the record has its default. Nothing that only the record names is imported or made.
+    Raises `ConfigError` if a class has no such field today."""
+    return differences(_completed(recorded, today), today)
+
+
+def _completed(recorded: Any, today: Any) -> Any:
+    """The record with the defaults of fields that are newer than it."""
+    if isinstance(recorded, list) and isinstance(today, list) and len(recorded) == len(today):
+        return [_completed(*pair) for pair in zip(recorded, today, strict=True)]
+    if not (isinstance(recorded, dict) and isinstance(today, dict)):
+        return recorded
+    same = {k: _completed(v, today[k]) if k in today else v for k, v in recorded.items()}
+    if "class" not in recorded or recorded["class"] != today.get("class"):
+        return same
+    known = {f.name: f for f in dataclasses.fields(find_class(recorded["class"]))}
+    for name in recorded.keys() - {"class", *known}:
+        raise ConfigError(f"{recorded['class']} has no field {name!r}{suggestion(name, [*known])}")
+    newer = {k: f.default for k, f in known.items() if k not in recorded}
+    made = {k: to_tree(v) for k, v in newer.items() if v is not dataclasses.MISSING}
+    return same | made
+
+
+def replaced(algorithm: Any, changes: dict[str, Any]) -> Any:
+    """`algorithm` with other numbers and strings, named as in `learners.0.gamma`. Raises
+    `ConfigError`."""
+    tree = to_tree(algorithm)
+    for name, value in changes.items():
+        *inner, last = name.split(".")
+        node = tree
+        for part in inner:
+            node = _inside(node, part, name)
+        old = _inside(node, last, name)
+        plain = (bool, int, float, str, type(None))
+        if isinstance(old, dict | list) or not isinstance(value, plain):
+            raise ConfigError(f"{name} is {value!r}: only numbers and strings can be changed")
+        if last == "class" or (inner[:1] == ["env"] and isinstance(old, str)):
+            raise ConfigError(f"{name} makes another task or method: that is a new run")
+        node[int(last) if isinstance(node, list) else last] = value
+    return from_tree(tree)
+
+
+def _inside(node: Any, part: str, name: str) -> Any:
+    """The entry `part` of an object's tree."""
+    if not isinstance(node, dict | list):
+        raise ConfigError(f"no setting {name!r}: what stands before {part!r} has no parts")
+    known = list(map(str, range(len(node)))) if isinstance(node, list) else list(node)
+    if part not in known:
+        fields = ", ".join(k for k in known if k != "class")
+        raise ConfigError(
+            f"no setting {name!r}: there is no {part!r}{suggestion(part, known)} in {fields}"
+        )
+    return node[int(part)] if isinstance(node, list) else node[part]
 
 
 def machine() -> dict[str, Any]:

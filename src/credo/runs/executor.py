@@ -4,22 +4,28 @@ both. What is finished is not run again; what was stopped goes on."""
 import contextlib
 import dataclasses
 import json
+import os
 import pathlib
+import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from . import checkpoint, config, log
+from . import checkpoint, config, log, screen, worker
 from .budget import Budget
-from .loop import Interrupted, Run, RunError, Signals
+from .loop import Interrupted, Run, RunError
 from .progress import clock
+from .signals import Signals
 
 TOLD = 60.0  # seconds between two lines on the runs under way, where there is no terminal
+GRACE = 10.0  # seconds that a worker without a job has to end in
+SAVE = 3600.0  # seconds that workers have to finish a generation and save, after a signal
 
 
 @dataclasses.dataclass
@@ -93,6 +99,7 @@ class Job:
         return f"{self.path.name} {done}"
 
 
+@screen.calm()
 def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> None:
     """Train every unfinished job. Raises `RunError` with the failures after all have been tried,
     `Interrupted` after a signal: the workers save first."""
@@ -126,20 +133,23 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
                 process = _start(core)
         _end(process)
 
-    with Signals() as signals, Board(title, len(jobs), len(waiting)) as board:
+    board = Board(title, len(jobs), len(waiting))
+    with _no_orphans(), Signals(quiet=False, end=_kill_all) as signals, board:
         threads = [
             threading.Thread(target=work, args=(cores[i % len(cores)],), daemon=True)
             for i in range(workers)
         ]
         for thread in threads:
             thread.start()
-        told = False
+        told = None
         while any(thread.is_alive() for thread in threads):
-            if signals.received and not told:
-                told = True
+            if signals.received and told is None:
+                told = time.monotonic()
                 for process in list(_processes):
                     if process.poll() is None:
                         process.send_signal(signals.received)
+            if told is not None and time.monotonic() - told > SAVE:
+                _kill_all()
             with guard:
                 board.show(under_way)
             time.sleep(0.05)
@@ -205,11 +215,13 @@ _processes: list[subprocess.Popen] = []
 
 def _start(core: int) -> subprocess.Popen:
     process = subprocess.Popen(
-        [sys.executable, "-m", "credo.runs.worker", str(core)],
+        worker.command(core),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
-        start_new_session=True,  # a Ctrl-C reaches the parent alone, which passes it on
+        # A Ctrl-C reaches the parent alone, which passes it on; and what a worker starts is in a
+        # group with it, and ends with it.
+        start_new_session=True,
     )
     _processes.append(process)
     return process
@@ -224,8 +236,10 @@ def _ask(process: subprocess.Popen, job: Job) -> dict[str, Any]:
         process.stdin.flush()
         return json.loads(process.stdout.readline())
     except (OSError, json.JSONDecodeError):
-        process.kill()  # else the next job might still be given to it
-        return {"error": f"its process ended with exit code {process.wait()}"}
+        with contextlib.suppress(subprocess.TimeoutExpired):  # it may be about to end by itself
+            process.wait(0.5)
+        _kill(process)  # else the next job might still be given to it
+        return {"error": f"its process ended with exit code {process.returncode}"}
 
 
 def _end(process: subprocess.Popen) -> None:
@@ -233,5 +247,43 @@ def _end(process: subprocess.Popen) -> None:
     assert process.stdout is not None
     with contextlib.suppress(BrokenPipeError):
         process.stdin.close()
-    process.wait()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(GRACE)
+    _kill(process)
     process.stdout.close()
+
+
+def _kill(process: subprocess.Popen) -> None:
+    """End a worker and whatever it started, in a bounded time."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        if process.poll() is None or _leads(process.pid):
+            os.killpg(process.pid, signal.SIGKILL)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.kill()
+        process.wait(GRACE)
+    with contextlib.suppress(ValueError):
+        _processes.remove(process)
+
+
+def _leads(group: int) -> bool:
+    """Whether processes are left in the group that a worker led. While there are, its number is
+    given to no other process."""
+    try:
+        os.killpg(group, 0)
+    except (ProcessLookupError, PermissionError):
+        return False
+    return True
+
+
+def _kill_all() -> None:
+    for process in list(_processes):
+        _kill(process)
+
+
+@contextlib.contextmanager
+def _no_orphans() -> Iterator[None]:
+    """No worker is left, however the block ends: by an error or a second Ctrl-C too."""
+    try:
+        yield
+    finally:
+        _kill_all()

@@ -46,7 +46,7 @@ def whole(path: str | os.PathLike[str]) -> Iterator[Path]:
             if os.fstat(descriptor).st_nlink:  # or it would be somebody else's
                 remove(draft)
         if isinstance(error, OSError):
-            raise _named(error, path) from error
+            raise named(error, path) from error
         raise
     finally:
         os.close(descriptor)
@@ -144,7 +144,7 @@ def opened(path: str | os.PathLike[str], flags: int, *, follow: bool = False) ->
         descriptor = os.open(path, flags, 0o666)
     except OSError as error:
         if error.errno == errno.ELOOP and not follow:
-            raise OSError(errno.ELOOP, "is a link, which is never followed", str(path)) from None
+            raise OSError(errno.ELOOP, "is a link and not followed: remove it", str(path)) from None
         raise
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return descriptor
@@ -153,12 +153,21 @@ def opened(path: str | os.PathLike[str], flags: int, *, follow: bool = False) ->
 
 
 def sync(path: str | os.PathLike[str]) -> None:
-    """Put a file, or the names in a folder, on the disk."""
+    """Put a file, or the names in a folder, on the disk. Raises `OSError`."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        raise named(error, path) from error
     finally:
         os.close(descriptor)
+
+
+def named(error: OSError, path: str | os.PathLike[str]) -> OSError:
+    """The same error with its file: what is written to a descriptor fails without a name."""
+    if error.filename is not None or error.errno is None:
+        return error
+    return OSError(error.errno, error.strerror, str(path))
 
 
 def advice(error: OSError) -> str:
@@ -175,11 +184,4 @@ def _write(descriptor: int, path: str | os.PathLike[str], chunks: Iterable[Chunk
             try:
                 rest = rest[os.write(descriptor, rest) :]
             except OSError as error:
-                raise _named(error, path) from error
-
-
-def _named(error: OSError, path: str | os.PathLike[str]) -> OSError:
-    """The same error with its file: what is written to a descriptor fails without a name."""
-    if error.filename is not None or error.errno is None:
-        return error
-    return OSError(error.errno, error.strerror, str(path))
+                raise named(error, path) from error

@@ -9,6 +9,10 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
+from . import files
+
+MOST = 1000  # bytes of a holder's name
+
 
 class RunLocked(Exception):
     """Another process works on the same run."""
@@ -22,25 +26,40 @@ def lock(run_directory: Path) -> Iterator[None]:
     process, however that ends, and a file that stays behind means nothing. Processes forked
     inside the block hold it too; those started anew do not.
 
-    Raises `RunLocked`, which names the holder, if another process (or this one) has the lock.
+    Raises `RunLocked`, which names the holder, if another process (or this one) has the lock, and
+    `OSError` if the file cannot be made, or is a link: it is never followed.
     """
     path = Path(run_directory) / "lock"
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "a+") as file:  # "a+" does not empty the file: its holder's name is in it
+    # The file is not emptied before it is owned: its holder's name is in it.
+    descriptor = files.opened(path, os.O_RDWR | os.O_CREAT | os.O_APPEND)
+    try:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            file.seek(0)
-            raise RunLocked(_message(Path(run_directory), file.read())) from None
+            content = os.pread(descriptor, MOST, 0).decode(errors="replace")
+            raise RunLocked(_message(Path(run_directory), content)) from None
+        except OSError as error:  # of a file system without locks
+            raise files.named(error, path) from error
         now = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
-        file.truncate(0)
-        json.dump({"pid": os.getpid(), "host": socket.gethostname(), "started": now}, file)
-        file.flush()
+        holder = {"pid": os.getpid(), "host": socket.gethostname(), "started": now}
+        _write(descriptor, json.dumps(holder))
         try:
             yield
         finally:
-            file.truncate(0)
-            fcntl.flock(file, fcntl.LOCK_UN)  # a forked child may keep the file open
+            _write(descriptor, "")
+            fcntl.flock(descriptor, fcntl.LOCK_UN)  # a forked child may keep the file open
+    finally:
+        os.close(descriptor)
+
+
+def _write(descriptor: int, content: str) -> None:
+    # The name is only for others to read: on a full disk the lock holds without it, and a file
+    # with a second name may be somebody else's.
+    with contextlib.suppress(OSError):
+        if os.fstat(descriptor).st_nlink == 1:
+            os.truncate(descriptor, 0)
+            os.write(descriptor, content.encode())
 
 
 def _message(run_directory: Path, content: str) -> str:

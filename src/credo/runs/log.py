@@ -1,72 +1,268 @@
 """Metrics on disk: `metrics.csv` (only what a rerun repeats bit for bit), `timing.csv` (the clock)
-and TensorBoard events."""
+and TensorBoard events.
 
+Only the first is worth an error. Each checkpoint seals the rows up to its own (`seal`, `verify`):
+a file that somebody cut, mixed up or damaged is named before a number in it is believed. What goes
+wrong with the other two is a warning, once, and training goes on without them.
+"""
+
+import contextlib
 import csv
+import hashlib
 import os
 import pathlib
-from collections.abc import Sequence
+import socket
+import stat
+import struct
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, cast
 
 import numpy as np
+
+from . import files
+
+METRICS, TIMING = "metrics.csv", "timing.csv"
+CLOCK = ["generation", "seconds", "generations_per_second"]
+MOST = 2**30  # bytes of a table
+
+Row = dict[str, float | int]
+
+
+class DamagedLog(ValueError):
+    """A table is not as it was written; the message names the file and says what to do."""
 
 
 class Log:
     """Appends rows. A run that is resumed is cut back to its checkpoint, so that generations are
-    strictly increasing and equal to those of an undisturbed run."""
+    strictly increasing and equal to those of an undisturbed run.
+
+    `elapsed`: seconds of training before, as far as `timing.csv` tells.
+    """
 
     def __init__(self, directory: pathlib.Path, generation: int, *, tensorboard: bool = True):
-        """`generation`: how many are done; rows of later ones are removed."""
+        """`generation`: how many are done; rows of later ones are removed.
+
+        Raises `DamagedLog` if `metrics.csv` lacks the row of `generation`, and `OSError` if it
+        cannot be written.
+        """
         self.directory = directory
-        for name in ("metrics.csv", "timing.csv"):
-            _cut(directory / name, generation)
-        self.events = None
+        _sealed.pop(directory / METRICS, None)
+        with _explained():
+            _cut(directory / METRICS, generation)
+        self.clock, self.events, self.elapsed = True, None, 0.0
+        self.clock = self._spare(f"{TIMING} is no longer written", self._wind, generation)
         if tensorboard:
-            from tensorboardX import SummaryWriter  # half a second that a closed log need not pay
+            self._spare("TensorBoard events are not written", self._begin_events, generation)
 
-            self.events = SummaryWriter(
-                str(directory / "tensorboard"), purge_step=generation + 1, flush_secs=10
-            )
-
-    def append(self, rows: Sequence[dict[str, float | int]], seconds: float, elapsed: float):
+    def append(self, rows: Sequence[Row], seconds: float, elapsed: float):
         """`rows`: one per generation, in order; `seconds` they took together; `elapsed` so far.
 
-        Raises `ValueError` if their names are not those of the rows before.
+        Raises `ValueError` if their names are not those of the rows before, and `OSError`, with
+        what to do, if `metrics.csv` cannot be written: it then has none of the rows.
         """
-        _append(self.directory / "metrics.csv", rows)
-        last = {"generation": rows[-1]["generation"], "seconds": elapsed}
-        last["generations_per_second"] = len(rows) / max(seconds, 1e-9)
-        _append(self.directory / "timing.csv", [last])
+        with _explained():
+            _append(self.directory / METRICS, rows)
+        if self.clock:
+            pace = len(rows) / max(seconds, 1e-9)
+            row = dict(zip(CLOCK, [rows[-1]["generation"], elapsed, pace], strict=True))
+            what = f"{TIMING} is no longer written"
+            self.clock = self._spare(what, _append, self.directory / TIMING, [row])
         if self.events is not None:
-            for row in rows:
-                for name, value in row.items():
-                    # tensorboardX would print a line about every NaN.
-                    if name != "generation" and np.isfinite(value):
-                        self.events.add_scalar(name, value, int(row["generation"]))
+            what = "TensorBoard events are no longer written"
+            if not self._spare(what, self.events.append, rows):
+                self.events = None
 
     def sync(self):
-        """Put the rows on the disk: a checkpoint must never be ahead of them."""
-        for name in ("metrics.csv", "timing.csv"):
-            if (self.directory / name).exists():
-                with (self.directory / name).open("rb") as file:
-                    os.fsync(file.fileno())
+        """Put the rows on the disk: a checkpoint must never be ahead of them. Raises `OSError`."""
+        if (self.directory / METRICS).exists():
+            with _explained():
+                files.sync(self.directory / METRICS)
+                files.sync(self.directory)
+        if self.clock and (self.directory / TIMING).exists():
+            what = f"{TIMING} is no longer written"
+            self.clock = self._spare(what, files.sync, self.directory / TIMING)
 
     def close(self):
-        if self.events is not None:
-            self.events.close()
+        """Write no more events."""
+        self.events = None
+
+    def _wind(self, generation: int):
+        """Go on with the clock's file, or begin a new one if it is not as we write it."""
+        path = self.directory / TIMING
+        try:
+            _cut(path, generation, every=False)
+            seconds = read(path).get("seconds", np.zeros(1))
+            if _header(path) not in (None, CLOCK) or not np.isfinite(seconds).all():
+                raise DamagedLog(f"{path} is not the clock of a run")
+            self.elapsed = float(seconds[-1])
+        except ValueError as error:
+            _warn(f"{error}: begun anew; times in it are lost, no result is")
+            files.remove(path)
+
+    def _begin_events(self, generation: int):
+        self.events = Events(self.directory / "tensorboard", generation + 1)
+
+    def _spare(self, what: str, action: Callable[..., None], *arguments: Any) -> bool:
+        """Do what training can do without; whether it worked."""
+        try:
+            action(*arguments)
+        except OSError as error:
+            _warn(f"{what}: {error}; training goes on")
+            return False
+        return True
+
+
+class Events:
+    """A file of TensorBoard events, written by the caller's thread: nothing waits for a queue, and
+    what is written can be looked at."""
+
+    def __init__(self, directory: pathlib.Path, first: int):
+        """`first`: the step from which on what earlier files say is void. Raises `OSError`."""
+        # A tenth of a second that a closed log need not pay.
+        from tensorboardX.proto import event_pb2, summary_pb2
+
+        messages: Any = event_pb2  # its names are made when it is imported
+        self.event, self.summary = messages.Event, cast(Any, summary_pb2).Summary
+        directory.mkdir(parents=True, exist_ok=True)
+        now = f"{time.time():010.0f}.{socket.gethostname()}.{os.getpid()}.{time.monotonic_ns()}"
+        self.path = directory / f"events.out.tfevents.{now}"
+        began = messages.SessionLog(status=messages.SessionLog.START)
+        first_two = [
+            self.event(file_version="brain.Event:2"),
+            self.event(step=first, session_log=began),
+        ]
+        files.write_new(self.path, self._records(first_two))
+
+    def append(self, rows: Sequence[Row]):
+        """One event for each row, with all its finite numbers. Raises `OSError`."""
+        events = []
+        for row in rows:
+            values = [
+                self.summary.Value(tag=name, simple_value=float(value))
+                for name, value in row.items()
+                if name != "generation" and np.isfinite(value)
+            ]
+            step = int(row["generation"])
+            events.append(self.event(step=step, summary=self.summary(value=values)))
+        files.append(self.path, b"".join(self._records(events)))
+
+    def _records(self, events: Sequence[Any]) -> list[bytes]:
+        """Each event as the format has it: length, its checksum, data, their checksum."""
+        from tensorboardX.record_writer import masked_crc32c
+
+        records = []
+        for event in events:
+            event.wall_time = time.time()
+            data = event.SerializeToString()
+            length = struct.pack("<Q", len(data))
+            sums = (struct.pack("<I", masked_crc32c(part)) for part in (length, data))
+            records.append(b"".join((length, next(sums), data, next(sums))))
+        return records
+
+
+# The seal of the rows that a checkpoint stands on.
+
+
+class _Sealed(NamedTuple):
+    file: int  # the inode: a table that was cut is another file
+    generation: int
+    size: int
+    digest: Any
+
+
+_sealed: dict[pathlib.Path, _Sealed] = {}  # so that no byte is hashed twice while a run goes on
+
+
+def seal(directory: pathlib.Path, generation: int) -> dict[str, Any]:
+    """Length and SHA-256 of `metrics.csv` in `directory` up to and with the row of `generation`,
+    as JSON, for `verify`. Of generation 0, which has no row, those of nothing.
+
+    Raises `DamagedLog` if there is no such row.
+    """
+    path = directory / METRICS
+    if generation == 0:
+        return {"bytes": 0, "sha256": hashlib.sha256().hexdigest()}
+    try:
+        descriptor = files.opened(path, os.O_RDONLY, follow=True)
+    except FileNotFoundError:
+        raise _missing(path, generation) from None
+    with open(descriptor, "rb") as file:
+        inode = os.fstat(descriptor).st_ino
+        known = _sealed.get(path)
+        if known is None or known.file != inode or known.generation > generation:
+            known = _Sealed(inode, 0, 0, hashlib.sha256())
+        size, digest, at = known.size, known.digest.copy(), known.generation
+        file.seek(size)
+        while at != generation:
+            line = file.readline()
+            if not line.endswith(b"\n"):
+                raise _missing(path, generation)
+            size += len(line)
+            digest.update(line)
+            at = _generation(line)
+    _sealed[path] = _Sealed(inode, generation, size, digest)
+    return {"bytes": size, "sha256": digest.hexdigest()}
+
+
+def verify(directory: pathlib.Path, seal: dict[str, Any]) -> None:
+    """Raises `DamagedLog` if the rows that `seal` was made of are not in `metrics.csv` in
+    `directory`, bit for bit; what comes after them may be anything."""
+    path, size = directory / METRICS, seal["bytes"]
+    digest, left = hashlib.sha256(), size
+    try:
+        with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
+            while left and (data := file.read(min(left, 2**20))):
+                digest.update(data)
+                left -= len(data)
+    except OSError as error:
+        if size == 0 and isinstance(error, FileNotFoundError):
+            return
+        raise DamagedLog(f"{path} cannot be read ({error}): {HELP}") from error
+    if left:
+        raise DamagedLog(
+            f"{path} was cut: it has {size - left:,} of the {size:,} bytes that a checkpoint "
+            f"stands on; {HELP}"
+        )
+    if digest.hexdigest() != seal["sha256"]:
+        raise DamagedLog(
+            f"{path} was changed: the SHA-256 of its first {size:,} bytes is not the one that a "
+            f"checkpoint says; {HELP}"
+        )
+
+
+HELP = "restore it from a copy"
+
+
+def _missing(path: pathlib.Path, generation: int) -> DamagedLog:
+    return DamagedLog(f"{path} has no row of generation {generation}, which is done: {HELP}")
+
+
+# Tables.
 
 
 def read(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """The columns of a metrics file; empty if there is none. A half-written line is left out."""
-    if not path.exists():
+    """The columns of a metrics file; empty if there is none. A half-written line is left out.
+
+    Raises `DamagedLog`, which names file and line, if it is no table of numbers.
+    """
+    lines = _lines(path)
+    if not lines:
         return {}
-    with path.open(newline="") as file:
-        rows = list(csv.reader(line for line in file if line.endswith("\n")))
-    if not rows:
-        return {}
-    columns = zip(*rows[1:], strict=True) if rows[1:] else ([] for _ in rows[0])
-    return {
-        name: np.array([float(x) for x in column])
-        for name, column in zip(rows[0], columns, strict=True)
-    }
+    header, rows = _cells(path, lines[0]), []
+    for number, line in enumerate(lines[1:], 2):
+        try:
+            rows.append([float(cell) for cell in line.split(b",")])
+        except ValueError:
+            rows.append([])
+        if len(rows[-1]) != len(header):
+            raise DamagedLog(
+                f"{path} is damaged: its line {number} is {line[:80]!r} where {len(header)} "
+                f"numbers are expected; {HELP}"
+            )
+    columns = np.array(rows, float).reshape(len(rows), len(header)).T
+    return {name: column.copy() for name, column in zip(header, columns, strict=True)}
 
 
 def last(path: pathlib.Path) -> dict[str, str]:
@@ -74,19 +270,49 @@ def last(path: pathlib.Path) -> dict[str, str]:
     header = _header(path)
     if header is None:
         return {}
-    with path.open("rb") as file:
-        file.seek(0, os.SEEK_END)
-        file.seek(max(0, file.tell() - 2**16))
-        whole = file.read().decode().split("\n")[1:-1]  # the first may lack its beginning
-    return dict(zip(header, whole[-1].split(","), strict=True)) if whole else {}
+    with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - 2**16))
+        whole = file.read().split(b"\n")[1:-1]  # the first may lack its beginning
+    if not whole:
+        return {}
+    cells = _cells(path, whole[-1])
+    if len(cells) != len(header):
+        raise DamagedLog(
+            f"{path} is damaged: its last line has {len(cells)} columns, its header {len(header)}; "
+            f"{HELP}"
+        )
+    return dict(zip(header, cells, strict=True))
+
+
+def _lines(path: pathlib.Path) -> list[bytes]:
+    """The whole lines of a file, none if there is no file."""
+    try:
+        return files.read_bytes(path, MOST).split(b"\n")[:-1]
+    except FileNotFoundError:
+        return []
+
+
+def _cells(path: pathlib.Path, line: bytes) -> list[str]:
+    try:
+        return next(csv.reader([line.decode()]), [])
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DamagedLog(f"{path} is damaged: {error} in {line[:80]!r}; {HELP}") from error
+
+
+def _generation(line: bytes) -> int | None:
+    """That of a row; None if it is no row."""
+    start = line.partition(b",")[0]
+    return int(start) if start.isdigit() and len(start) < 20 else None
 
 
 def _header(path: pathlib.Path) -> list[str] | None:
-    if not path.exists():
+    try:
+        with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
+            line = file.readline(2**20)
+    except FileNotFoundError:
         return None
-    with path.open() as file:
-        line = file.readline()
-    return line[:-1].split(",") if line.endswith("\n") else None
+    return _cells(path, line[:-1]) if line.endswith(b"\n") else None
 
 
 def _text(value: float | int) -> str:
@@ -94,41 +320,55 @@ def _text(value: float | int) -> str:
     return str(int(value)) if isinstance(value, int | np.integer) else f"{float(value):.9g}"
 
 
-def _append(path: pathlib.Path, rows: Sequence[dict[str, float | int]]):
+def _line(cells: Sequence[str]) -> str:
+    cells = [f'"{x.replace(chr(34), 2 * chr(34))}"' if set(x) & set(',"\r\n') else x for x in cells]
+    return ",".join(cells) + "\n"
+
+
+def _append(path: pathlib.Path, rows: Sequence[Row]):
     names = list(rows[0])
-    header = _header(path) or names
-    if header != names:
+    header = _header(path)
+    if header not in (None, names):
         raise ValueError(
             f"a generation has the metrics {', '.join(names)}, but {path} has "
             f"{', '.join(header)}: they must be the same in every generation"
         )
-    try:
-        with path.open("a", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            if file.tell() == 0:
-                writer.writerow(names)
-            writer.writerows([_text(value) for value in row.values()] for row in rows)
-    except OSError as error:
-        help = f"{error.strerror}: free some space, then resume; checkpoints are intact"
-        raise OSError(error.errno, help, str(path)) from error
+    lines = [_line([_text(value) for value in row.values()]) for row in rows]
+    files.append(path, "".join(([] if header else [_line(names)]) + lines).encode())
 
 
-def _cut(path: pathlib.Path, generation: int):
-    """Keep the header and the rows up to `generation`; a half-written line goes too."""
-    if not path.exists():
+def _cut(path: pathlib.Path, generation: int, *, every: bool = True):
+    """Keep the header and the rows up to `generation`, at which they end if `every` one has a row;
+    what a killed process left behind them goes."""
+    lines, kept, at = _lines(path), [], 0
+    for line in lines[1:]:
+        found = _generation(line)
+        if at == generation or found is None or found > generation:
+            break
+        kept.append(line)
+        at = found
+    if every and at != generation:
+        raise _missing(path, generation)
+    text = b"".join(line + b"\n" for line in (lines[:1] + kept if kept else []))
+    if not text:
+        files.remove(path)
         return
-    lines = path.read_text().splitlines(keepends=True)
-    kept = [
-        line
-        for line in lines[1:]
-        if line.endswith("\n")
-        and line.count(",") == lines[0].count(",")
-        and int(line.split(",")[0]) <= generation
-    ]
-    draft = path.with_name(f".{path.name}.draft")
-    draft.write_text("".join([lines[0], *kept]) if kept else "")
-    if kept:
-        os.replace(draft, path)
-    else:
-        draft.unlink()
-        path.unlink()
+    status = os.lstat(path)
+    # A link, or another name of the same file, would be somebody else's.
+    ours = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
+    if not ours or status.st_size != len(text):
+        files.write_whole(path, [text])
+
+
+@contextlib.contextmanager
+def _explained() -> Iterator[None]:
+    """Say what to do about an error of the disk."""
+    try:
+        yield
+    except OSError as error:
+        help = f"{error.strerror}: {files.advice(error)}, then resume; checkpoints are intact"
+        raise OSError(error.errno, help, error.filename) from error
+
+
+def _warn(message: str):
+    warnings.warn(message, stacklevel=4)

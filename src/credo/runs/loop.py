@@ -13,15 +13,10 @@ A run is a folder:
 import contextlib
 import dataclasses
 import json
-import os
 import pathlib
-import re
-import shutil
-import signal
-import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -33,22 +28,23 @@ from jaxtyping import PRNGKeyArray, PyTree
 from .. import compilation, require
 from ..compilation import jit
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
-from ..replay import shapes_alone
-from . import checkpoint, config, log, policy
-from .budget import Budget
+from ..replay import Replay, shapes_alone
+from . import checkpoint, config, files, log, policy, record, screen, weights
+from .budget import Budget, fitted
+from .folder import free_name, new_folder
+from .folder import runs_in as runs_in
 from .lock import lock
 from .policy import Policy
 from .progress import Progress
+from .record import RunError
+from .signals import Signals
+from .trust import seal, short, signed_here
 
 CHUNK = 64  # generations in one dispatch, at most
 DISPATCH = 0.3  # seconds that one dispatch should last
 MOST = 2**31 - 1  # what 32 bits hold
 
 Callback = Callable[[int, dict[str, Any]], bool | None]
-
-
-class RunError(RuntimeError):
-    """A run that cannot start or go on; the message says what to do."""
 
 
 class Interrupted(RunError):
@@ -62,40 +58,56 @@ class Interrupted(RunError):
 class Run:
     """A run on disk, finished or not."""
 
-    def __init__(self, path: str | pathlib.Path):
+    def __init__(self, path: str | pathlib.Path, *, trust: bool = False):
+        """`trust`: whether classes and environments of somebody's own may be imported that a run
+        names which this user did not make. Raises `RunError`."""
         self.path = pathlib.Path(path)
-        if not (self.path / "config.json").exists():
-            raise RunError(
-                f"{self.path} is not a run: it has no config.json; name a folder that "
-                "`credo train` made"
-            )
-        try:
-            self.config = json.loads((self.path / "config.json").read_text())
-        except json.JSONDecodeError as error:
-            raise RunError(f"{self.path / 'config.json'} is damaged: {error}") from error
+        self.config = record.read(self.path)
+        self.trusted = trust or signed_here(self.config)
 
     @property
     def algorithm(self) -> Any:
-        return config.from_tree(self.config["algorithm"])
+        """What was recorded, as an object. A team outside JAX is opened for it, no other task."""
+        tree = self.config["algorithm"]
+        with _found(self):
+            return config.from_tree(tree, trust=self.trusted, source=str(self.path))
+
+    def part(self, name: str) -> Any:
+        """A field of the recorded algorithm as an object (its `env`, `network`, `learners`), made
+        of Credo's own classes; None if somebody's own code would have to be imported for it. It
+        opens no environment."""
+        try:
+            return config.from_tree(self.config["algorithm"].get(name), trust=False)
+        except ValueError:
+            return None
 
     @property
     def metrics(self) -> dict[str, np.ndarray]:
-        """Columns of `metrics.csv`, one entry per generation."""
+        """Columns of `metrics.csv`, one entry per generation. Raises `RunError` if it is not what
+        the newest checkpoint says it was."""
+        _verify_metrics(self.path)
         return log.read(self.path / "metrics.csv")
 
     @property
     def champion(self) -> PyTree:
         """The policy with the highest fitness of the last generation; of a learner alone, its
-        actor."""
-        with shapes_alone():
-            like = eqx.filter_eval_shape(self.algorithm.init, key=jax.random.key(0)).champion
-        return checkpoint.import_policy(self.path / "champion.safetensors", like)
+        actor. Raises `RunError` if it is another run's, or if the task has other sizes today."""
+        algorithm = self.algorithm
+        with _found(self), shapes_alone():
+            record.check_task(self.config, algorithm.env)
+            like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0)).champion
+        return _champion(self, like)
+
+    def restored(self, like: PyTree) -> PyTree:
+        """The champion, of which `like` has the structure. Raises as `champion` does."""
+        return _champion(self, like)
 
     def policy(self, raw: bool = False) -> Policy:
         """The champion as a plain callable, in the task's own units; `raw`: in [-1, 1]."""
         return policy.of(self, raw)
 
 
+@screen.calm()
 def train(
     algorithm: Any,
     *,
@@ -119,7 +131,7 @@ def train(
     - `generations`, `frames` (environment steps): the budget. The run ends after the first
       generation that reaches one of them; without both, the algorithm's `default_budget`, or
       else 1000 generations.
-    - `seed`: everything random follows from it.
+    - `seed`: everything random follows from it; 0 to 2^32 - 1.
     - `path`: the run's folder; by default `runs/<algorithm>-<task>-<seed>`.
     - `warm_start`: another run, whose champion this one starts from.
     - `stop_at`: end early once a generation's `champion_score` reaches this.
@@ -128,43 +140,47 @@ def train(
     - `callback(generation, metrics)`: called for every generation, after the dispatch it ran in;
       return True to end. What the dispatch has run by then is kept.
 
-    **Raises:** `RunError` if the folder holds a run already, if the algorithm cannot start from
-    a policy, or if an environment outside JAX fails; `Interrupted` after a signal.
+    **Raises:** `RunError` if there is anything in the folder already, if the algorithm cannot start
+    from a policy, if weights are no numbers any more, or if an environment outside JAX fails;
+    `ValueError` for a seed or a budget that cannot be; `Interrupted` after a signal.
     """
     compilation.enable_cache()
     budget = Budget.of(algorithm, generations, frames, stop_at)
     require.at_least("keep", keep, 1)
-    record_of = config.to_tree(algorithm)
-    config.from_tree(record_of)  # what cannot be read back should fail now, not at a resume
+    if isinstance(seed, bool) or not (isinstance(seed, int) and 0 <= seed < 2**32):
+        raise ValueError(f"seed is {seed}: it must be a whole number from 0 to 2^32 - 1")
+    tree = config.to_tree(algorithm)
+    config.from_tree(tree)  # what cannot be read back should fail now, not at a resume
+    source = None if warm_start is None else Run(warm_start)
     path = pathlib.Path(path) if path else free_name(algorithm, seed)
-    if (path / "config.json").exists():
-        raise RunError(
-            f"{path} holds a run already: `credo resume {path}` goes on with it; choose another "
-            "path for a new one"
+    said: dict[str, Any] = {"algorithm": json.loads(json.dumps(tree)), "seed": seed}
+    said |= {"budget": budget.record(), "machine": config.machine()}
+    if prompt := config.of_a_prompt(tree):
+        said["resumable"] = False
+        warnings.warn(
+            f"{', '.join(prompt)} was defined at a prompt or in a notebook: this run can go on in "
+            "this session alone; put it into a file for one that can be resumed",
+            stacklevel=3,
         )
-    record = {
-        "algorithm": record_of,
-        "seed": seed,
-        "budget": budget.record(),
-        "machine": config.machine(),
-    }
     if warm_start is not None:
-        record["warm_start"] = str(warm_start)
-    with _new_folder(path):
-        # Left by a process that was killed before it wrote its config: nobody can resume it.
-        shutil.rmtree(path / "checkpoints", ignore_errors=True)
-        state = _initial(algorithm, jax.random.key(seed))
-        if warm_start is not None:
-            state = _warm(algorithm, state, Run(warm_start))
+        said["warm_start"] = str(warm_start)
+    with new_folder(path):
+        fit = fitted(algorithm, budget)
+        state = _initial(fit, jax.random.key(seed))
+        if source is not None:
+            state = _warm(algorithm, state, source)
+        said["task"] = record.task_of(algorithm.env)
+        files.remove(path / "checkpoints")  # left by a process that died here
         # The first checkpoint comes before the config: what has a config can be resumed.
-        checkpoint.save(path / "checkpoints", 0, eqx.filter(state, eqx.is_array), {"frames": 0})
-        del state  # it may fill half of the memory, and is read back
-        config.write_json(path / "config.json", record)
-        run = Run(path)
+        arrays, seals = eqx.filter(state, eqx.is_array), {"record": seal(said)}
+        checkpoint.save(path / "checkpoints", 0, arrays, {"frames": 0}, seals=seals)
+        del state, arrays  # it may fill half of the memory, and is read back
+        record.write(path, said)
+        run = Run(path, trust=True)
         return _train(
             run,
-            algorithm,
-            _load(run, algorithm),
+            fit,
+            _load(run, fit),
             wall_clock,
             checkpoint_every=checkpoint_every,
             keep=keep,
@@ -174,9 +190,13 @@ def train(
         )
 
 
+@screen.calm()
 def resume(
     path: str | pathlib.Path,
     *,
+    trust: bool = False,
+    set: Mapping[str, Any] | None = None,
+    without_replay: bool = False,
     generations: int | None = None,
     frames: int | None = None,
     stop_at: float | None = None,
@@ -192,28 +212,45 @@ def resume(
     The result has the same bits as that of a run never stopped (same machine and core count).
     A new budget takes the place of the whole old one: with `generations` alone a limit of frames
     is dropped, and the other way round; without `stop_at` that is dropped too.
+
+    **Arguments**, beside those of `train`:
+
+    - `trust`: as in `Run`; the run is then taken for one of this user's.
+    - `set`: other numbers and strings for the algorithm from here on, by the names of its fields:
+      `{"learner.actor_lr": 1e-4}`. Population, weights and replay buffer stay; config.json says
+      when what was changed.
+    - `without_replay`: go on with an empty replay buffer if its files are damaged.
+
+    **Raises:** as `train`; `RunError` if the task or the files are not those of this run.
     """
     compilation.enable_cache()
-    run = Run(path)
+    run = Run(path, trust=trust)
     with lock(run.path):
         algorithm = run.algorithm
-        saved = _load(run, algorithm)
         old = Budget.read(run.config["budget"])
+        budget = old if stop_at is None else dataclasses.replace(old, stop_at=stop_at)
         if generations is not None or frames is not None:
             budget = Budget.of(algorithm, generations, frames, stop_at)
-            try:
-                budget.refuse_smaller(old, saved.generation, int(saved.counters["frames"]))
-            except ValueError as error:
-                raise RunError(str(error)) from None
-        else:
-            budget = old if stop_at is None else dataclasses.replace(old, stop_at=stop_at)
-        if budget != old:
-            run.config["budget"] = budget.record()
-            config.write_json(run.path / "config.json", run.config)
+        # A smaller budget is refused, but only once it is known how far the run is.
+        fit = max(
+            (fitted(algorithm, limit) for limit in (old, budget)),
+            key=lambda one: getattr(one, "replay_capacity", 0),
+        )
+        with _found(run):
+            record.check_task(run.config, algorithm.env)
+            saved = _load(run, fit, without_replay)
+        try:
+            budget.refuse_smaller(old, saved.generation, int(saved.counters["frames"]))
+        except ValueError as error:
+            raise RunError(str(error)) from None
+        fit = _changed(run, fit, set or {}, saved.generation)
+        _record_budget(run, old, budget, saved.generation)
+        if run.config != record.read(run.path) or (trust and not signed_here(run.config)):
+            record.write(run.path, run.config)
         _warn_of_other_machine(run.config["machine"])
         return _train(
             run,
-            algorithm,
+            fit,
             saved,
             wall_clock,
             checkpoint_every=checkpoint_every,
@@ -224,11 +261,113 @@ def resume(
         )
 
 
-def _load(run: Run, algorithm: Any) -> checkpoint.Checkpoint:
-    """The newest intact checkpoint, its state whole."""
+def _record_budget(run: Run, old: Budget, budget: Budget, generation: int) -> None:
+    """Put another budget into the record, and the old one into its history."""
+    if budget != old:
+        change = {"generation": generation, "budget": old.record()}
+        run.config["changes"] = [*run.config.get("changes", []), change]
+        run.config["budget"] = budget.record()
+
+
+def _changed(run: Run, fit: Any, changes: Mapping[str, Any], generation: int) -> Any:
+    """The algorithm with other settings, of the same state, and put into the record."""
+    recorded, before = run.config["algorithm"], short(run.config["algorithm"])
+    if not changes:
+        return fit
+    new = config.replaced(fit, dict(changes))
+    if _shapes(new) != _shapes(fit):
+        told = ", ".join(f"{name}={value!r}" for name, value in changes.items())
+        raise RunError(
+            f"{told} changes the sizes of what {run.path} has learned: only numbers that change "
+            "none can be set on the way; start a new run, with --from for its champion"
+        )
+    tree = config.to_tree(config.replaced(run.algorithm, dict(changes)))
+    tree = json.loads(json.dumps(tree))
+    if tree != recorded:
+        change = {"generation": generation, "set": dict(changes), "before": before}
+        run.config["changes"] = [*run.config.get("changes", []), change]
+        run.config["algorithm"] = tree
+    return new
+
+
+def _shapes(algorithm: Any) -> Any:
+    """The structure, shapes and types of an algorithm's state."""
+    with shapes_alone():
+        like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0))
+    leaves, structure = jax.tree.flatten(like)
+    return structure, [(x.shape, x.dtype) if hasattr(x, "shape") else x for x in leaves]
+
+
+@contextlib.contextmanager
+def _found(run: Run) -> Iterator[None]:
+    """Say where a run began if what it names cannot be found from here."""
+    try:
+        yield
+    except (config.NotFound, EnvironmentFailure) as error:
+        home = record.home(run.config)
+        if not home:
+            raise
+        raise RunError(f"{str(error).rstrip('.')}{home}") from error
+
+
+def _champion(run: Run, like: PyTree) -> PyTree:
+    """The champion of a run, if that is what its file says."""
+    path = run.path / "champion.safetensors"
+    metadata = checkpoint.read_metadata(path)
+    if why := record.stranger(run.config, _json(metadata.get("record"))):
+        lines = config.differences(_json(metadata.get("algorithm")), run.config["algorithm"])
+        told = f" ({'; '.join(lines[:3])})" if lines else ""
+        raise RunError(
+            f"{path} is not this run's champion: {why}{told}; `credo resume {run.path}` writes it "
+            "again, or restore it from a copy"
+        )
+    return checkpoint.import_policy(path, like)
+
+
+def _json(text: str | None) -> Any:
+    try:
+        return json.loads(text or "null")
+    except ValueError:
+        return None
+
+
+def _verify_metrics(path: pathlib.Path) -> None:
+    """Raise `RunError` if metrics.csv is not what the newest intact checkpoint says it was."""
+    for folder in sorted((path / "checkpoints").glob("[0-9]*"), reverse=True):
+        try:
+            sealed = json.loads(files.read_bytes(folder / checkpoint.COMMIT))["seals"]["metrics"]
+        except (OSError, ValueError, KeyError, TypeError):
+            continue  # damaged, or written by an older version
+        why = _unlike(path, sealed)
+        if why is None:
+            return
+        if checkpoint.damage(folder) is None:
+            raise RunError(f"{why}, or `credo resume {path}` trains again what is not sure")
+
+
+def _unlike(path: pathlib.Path, sealed: Any) -> str | None:
+    """How metrics.csv differs from what a checkpoint sealed, in words."""
+    try:
+        log.verify(path, sealed)
+    except (ValueError, KeyError, TypeError) as error:
+        return str(error)
+    return None
+
+
+def _load(run: Run, algorithm: Any, without_replay: bool = False) -> checkpoint.Checkpoint:
+    """The newest intact checkpoint of this very run, its state whole."""
+
+    def check(generation: int, seals: Mapping[str, Any]) -> str | None:
+        why = record.stranger(run.config, seals.get("record"))
+        if why is None and "metrics" in seals:
+            why = _unlike(run.path, seals["metrics"])
+        return why
+
     like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0))
     like, static = eqx.partition(like, lambda x: isinstance(x, jax.ShapeDtypeStruct))
-    saved = checkpoint.load(run.path / "checkpoints", like)
+    saved = checkpoint.load(
+        run.path / "checkpoints", like, without_replay=without_replay, check=check
+    )
     return eqx.tree_at(lambda saved: saved.state, saved, eqx.combine(saved.state, static))
 
 
@@ -249,10 +388,11 @@ def _train(
     state, generation, frames = saved.state, saved.generation, int(saved.counters["frames"])
     del saved  # the state is donated: nobody may hold the old one
     budget = Budget.read(run.config["budget"])
+    log.Log(run.path, generation, tensorboard=False)  # what came after need not be readable
     rows = log.read(run.path / "metrics.csv")
     reached = budget.reached(generation, frames, _score_at(rows, generation))
     journal = log.Log(run.path, generation, tensorboard=tensorboard and not reached)
-    before = log.read(run.path / "timing.csv").get("seconds", np.zeros(1))[-1]
+    before = journal.elapsed
     began = last_save = time.monotonic()
     safe, chunk, ended = generation, 1, False
 
@@ -261,6 +401,8 @@ def _train(
         if reached:
             bar.say(f"is finished: {reached}; to go on give a larger --generations or --frames")
         else:
+            _require_sound(run, state, generation, safe)
+            bar.say_memory(_buffers(state))
             bar.start()
         while not (reached or ended or signals.received):
             tick = time.monotonic()
@@ -274,6 +416,7 @@ def _train(
                     f"resume with `credo resume {run.path}`"
                 ) from failure
             generation, frames = batch[-1]["generation"], batch[-1]["frames"]
+            _require_sound(run, state, generation, safe)
             now = time.monotonic()
             seconds = now - tick
             journal.append(batch, seconds, before + now - began)
@@ -285,14 +428,14 @@ def _train(
             reached = budget.reached(generation, frames, batch[-1]["champion_score"])
             if now - last_save >= checkpoint_every:
                 journal.sync()
-                _save(run, algorithm, generation, state, frames, keep)
+                _save(run, generation, state, frames, keep)
                 safe, last_save = generation, now
             # The first dispatch compiles; from the second on, its length follows the clock.
             # How many generations one dispatch holds is data and changes no result.
             chunk = 2 if chunk == 1 else int(np.clip(len(batch) * DISPATCH / seconds, 1, CHUNK))
         journal.close()
         journal.sync()
-        _save(run, algorithm, generation, state, frames, keep)
+        _save(run, generation, state, frames, keep)
     if signals.received and not reached:
         raise Interrupted(
             f"stopped at {budget.where(generation, frames)} and saved; go on with "
@@ -376,10 +519,15 @@ def _initial(algorithm: Any, root: PRNGKeyArray) -> PyTree:
     return algorithm.init(key=jax.random.fold_in(root, 0))
 
 
-def _save(run: Run, algorithm: Any, generation: int, state: PyTree, frames: int, keep: int):
-    arrays = eqx.filter(state, eqx.is_array)
-    checkpoint.save(run.path / "checkpoints", generation, arrays, {"frames": frames}, keep=keep)
-    metadata = {"algorithm": json.dumps(config.to_tree(algorithm)), "generation": str(generation)}
+def _save(run: Run, generation: int, state: PyTree, frames: int, keep: int):
+    arrays, sealed = eqx.filter(state, eqx.is_array), seal(run.config)
+    seals: dict[str, Any] = {"record": sealed}
+    if generation > 0:
+        seals["metrics"] = log.seal(run.path, generation)
+    counters = {"frames": frames}
+    checkpoint.save(run.path / "checkpoints", generation, arrays, counters, keep=keep, seals=seals)
+    metadata = {"algorithm": json.dumps(run.config["algorithm"]), "generation": str(generation)}
+    metadata["record"] = json.dumps(sealed, sort_keys=True)
     checkpoint.export_policy(run.path / "champion.safetensors", state.champion, metadata)
 
 
@@ -391,7 +539,7 @@ def _warm(algorithm: Any, state: PyTree, source: Run) -> PyTree:
             "algorithm with a method `warm(state, policy)` can"
         )
     try:
-        policy = checkpoint.import_policy(source.path / "champion.safetensors", state.champion)
+        policy = _champion(source, state.champion)
     except checkpoint.CheckpointError as error:
         if "does not fit" not in str(error):
             raise  # it is missing or damaged
@@ -404,22 +552,23 @@ def _warm(algorithm: Any, state: PyTree, source: Run) -> PyTree:
     return algorithm.warm(state, policy)
 
 
-@contextlib.contextmanager
-def _new_folder(path: pathlib.Path) -> Iterator[None]:
-    """Own a folder for a run. If none comes to be in it, the folder goes again."""
-    made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    with lock(path):
-        if (path / "config.json").exists():
-            raise RunError(f"another process started a run in {path} just now: choose another path")
-        try:
-            yield
-        except BaseException:
-            if made and not (path / "config.json").exists():
-                shutil.rmtree(path, ignore_errors=True)
-                with contextlib.suppress(OSError):  # something else may lie there by now
-                    for folder in made[1:]:
-                        folder.rmdir()
-            raise
+def _require_sound(run: Run, state: PyTree, generation: int, safe: int) -> None:
+    """End a training whose weights are no numbers any more: nothing can be learned from there."""
+    if (what := weights.broken(state)) is None:
+        return
+    stands = f"The checkpoint of generation {safe} stands"
+    if generation == safe:
+        stands = "It began so"
+    raise RunError(
+        f"the weights of {what} are not finite after generation {generation} of {run.path}: "
+        f"nothing more can be learned. {stands}; look at the size of rewards and observations, and "
+        "at the learning rates (credo resume RUN --set NAME=VALUE)"
+    )
+
+
+def _buffers(state: PyTree) -> list[Replay]:
+    leaves = jax.tree.leaves(state, is_leaf=lambda x: isinstance(x, Replay))
+    return [leaf for leaf in leaves if isinstance(leaf, Replay)]
 
 
 def _score_at(rows: dict[str, np.ndarray], generation: int) -> float:
@@ -427,18 +576,6 @@ def _score_at(rows: dict[str, np.ndarray], generation: int) -> float:
         return -np.inf
     match = np.flatnonzero(rows["generation"] == generation)
     return float(rows["champion_score"][match[-1]]) if match.size else -np.inf
-
-
-def free_name(algorithm: Any, seed: int | str, label: str = "") -> pathlib.Path:
-    """A folder that does not exist. `label`: what stands before the seed; by default the names of
-    the algorithm and the task."""
-    label = label or f"{type(algorithm).__name__}-{type(algorithm.env).__name__}"
-    name = re.sub(r"[^\w.]+", "-", f"{label}-{seed}".lower())
-    path, copies = pathlib.Path("runs") / name, 1
-    while path.exists():
-        copies += 1
-        path = pathlib.Path("runs") / f"{name}-{copies}"
-    return path
 
 
 def _warn_of_other_machine(recorded: dict[str, Any]):
@@ -453,30 +590,3 @@ def _warn_of_other_machine(recorded: dict[str, Any]):
                 f"this run began elsewhere ({'; '.join(lines)}): it goes on, but not bit for bit",
                 stacklevel=3,
             )
-
-
-class Signals:
-    """Ctrl-C and SIGTERM ask for an end after the generation; a second one stops at once."""
-
-    def __init__(self, quiet: bool = True):
-        self.received = 0
-        self.quiet = quiet
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self):
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._receive)
-        return self
-
-    def _receive(self, number, frame):
-        if self.received:
-            raise SystemExit(128 + number)
-        self.received = number
-        if not self.quiet:
-            # Not `print`: the signal may have come while the progress bar was being written.
-            os.write(2, b"\ncredo: stopping behind this generation; once more to stop at once\n")
-
-    def __exit__(self, *_):
-        for number, handler in self._before.items():
-            signal.signal(number, handler)

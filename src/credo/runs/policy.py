@@ -1,7 +1,6 @@
 """A run's best policy as a plain callable, in the units of its own task."""
 
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -10,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from ..environments.foreign import AbstractForeignEnvironment
 from ..environments.wrappers import DelayedHostReward, DelayedReward
 from ..networks.team import Team
 from ..runner import Units
-from . import checkpoint, config
+from .record import RunError
+from .record import task_of as task_record
 
 
 class Policy:
@@ -73,24 +72,20 @@ def of(run: Any, raw: bool = False) -> Policy:
 def champion(run: Any) -> PyTree:
     """The policy in a run's folder. Where its record tells the task's sizes and its networks are
     Credo's own, no environment is opened, and nothing of somebody's own is imported."""
-    tree, task = run.config["algorithm"], run.config.get("task")
-    names = [tree["class"], *_classes(tree.get("network"))]
-    if task is None or len(names) < 2 or not all(name.startswith("credo.") for name in names):
+    tree, network = run.config["algorithm"], run.part("network")
+    if network is None or "task" not in run.config or not tree["class"].startswith("credo."):
         return run.champion
-    like = _network_alone(tree, task)
-    return checkpoint.import_policy(run.path / "champion.safetensors", like)
+    return run.restored(_like(network, tree.get("normalize_observations"), _units(run)))
 
 
-def _network_alone(tree: dict[str, Any], task: Mapping[str, Any]) -> PyTree:
+def _like(network: Any, normalized: bool | None, units: Units) -> PyTree:
     """What an algorithm's policy looks like, from its record and that of the task."""
-    units = Units({**task, "actions": None})  # looks at the sizes
-    sizes = (units.obs_size, units.action_size)
-    network: Any = config.from_tree(tree["network"])
     if units.agents is not None and not network.team:  # CCEA has a population for each agent
         network = Team(trunk=(), head=network, sharing="nothing")
     team = (units.agents,) if network.team else ()
-    like = eqx.filter_eval_shape(network.init, *sizes, *team, key=jax.random.key(0))
-    if not tree.get("normalize_observations", False):
+    sizes = (units.obs_size, units.action_size, *team)
+    like = eqx.filter_eval_shape(network.init, *sizes, key=jax.random.key(0))
+    if not normalized:
         return like
     from ..networks.normalized import Normalized  # pyright: ignore[reportMissingImports]
 
@@ -98,15 +93,15 @@ def _network_alone(tree: dict[str, Any], task: Mapping[str, Any]) -> PyTree:
     return Normalized(like, shape, shape)
 
 
-def _classes(tree: Any) -> Iterator[str]:
-    """The names of all classes in a config's tree."""
-    if isinstance(tree, dict):
-        if "class" in tree:
-            yield str(tree["class"])
-        tree = list(tree.values())
-    if isinstance(tree, list):
-        for branch in tree:
-            yield from _classes(branch)
+def _units(run: Any) -> Units:
+    """How a run's record says that one speaks to its task. Raises `RunError`."""
+    try:
+        return Units(run.config["task"])
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
+        raise RunError(
+            f"{run.path / 'config.json'} is damaged: its task cannot be read "
+            f"({type(error).__name__}: {error}); restore it from a copy"
+        ) from error
 
 
 def undelayed(env: Any) -> Any:
@@ -117,20 +112,9 @@ def undelayed(env: Any) -> Any:
 
 
 def task_of(run: Any) -> Mapping[str, Any]:
-    """What a run's record tells of its task. One of an older Credo tells nothing: of a task of
-    others the environment is opened then, unless it is somebody's own code."""
-    if "task" in run.config:
-        return run.config["task"]
-    env = run.algorithm.env
-    foreign = undelayed(env)
-    if isinstance(foreign, AbstractForeignEnvironment):
-        if foreign.foreign_code is None:
-            return foreign.task_record()
-        warnings.warn(
-            f"{run.path} was made by an older Credo, which did not record the units of "
-            f"{foreign.foreign_code}: actions lie in [-1, 1], -1 is the low of a Box and 1 its "
-            "high",
-            stacklevel=3,
-        )
-    sizes = {name: getattr(env, name) for name in ("obs_size", "action_size", "agents")}
-    return sizes | {"actions": None}
+    """What a run's record tells of its task. One of an older Credo tells nothing: a task of others
+    is opened then, and refused if it is somebody's own code and the run is not trusted."""
+    if "task" not in run.config:
+        return task_record(run.algorithm.env)
+    _units(run)
+    return run.config["task"]

@@ -5,10 +5,12 @@ import sys
 import time
 from typing import Any
 
+import jax
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 
+from ..replay import Replay
 from .budget import Budget, short
 
 
@@ -42,6 +44,12 @@ class Progress:
         """A line that stays."""
         if self.shown:
             self.console.print(f"[dim]{self.path} {text}[/]", highlight=False, soft_wrap=True)
+
+    def say_memory(self, buffers: list[Replay]) -> None:
+        """How large replay buffers are."""
+        for buffer in buffers:
+            size = sum(leaf.nbytes for leaf in jax.tree.leaves(buffer.data))
+            self.say(f"has a replay buffer of {buffer.capacity:,} frames, {size / 1e6:,.1f} MB")
 
     def start(self) -> None:
         # True of a JAX task, whose first generation waits for it, and of any other, whose

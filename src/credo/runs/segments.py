@@ -7,8 +7,11 @@ fixed number, 16 MB of them. What the buffer holds of each part is a file in a c
 
 named by the buffer, the range of rows and their CRC-32. A buffer is only ever appended to, so all
 parts but the oldest and the newest are the same at the next checkpoint. They then have the same
-name, and the new checkpoint gets a hard link to the file that is there. So each part is written
-once, every checkpoint is complete in itself, and a part goes with the last checkpoint that has it.
+name, and the new checkpoint gets a hard link to a file that is there, but never to one of the
+checkpoint just before: it links to the one before that. So each part is written twice, whatever
+happens to one file leaves one of two neighbours whole, every checkpoint is complete in itself, and
+a part goes with the last checkpoint that has it. Where only one checkpoint is kept there is no
+neighbour, and each part is written once.
 
 The CRC-32 is that of the rows in memory, read at every checkpoint (4 GB/s): a buffer that is
 changed in any other way than by appending costs time, never rows.
@@ -109,6 +112,13 @@ class Stored(NamedTuple):
     shape: tuple[int, ...]
     parts: list[tuple[int, int, Path]]
 
+    def fitted(self, shape: tuple[int, ...]) -> "Stored":
+        """The same rows in a buffer of another capacity, if it was never full and they fit."""
+        written = max((stop for _, stop, _ in self.parts), default=0)
+        if self.shape[1:] != shape[1:] or written > min(self.shape[0], shape[0]):
+            return self
+        return self._replace(shape=tuple(shape))
+
     def read(self) -> np.ndarray:
         """The whole leaf; rows never written are zero. Raises what `safetensors` raises, and
         `ValueError` if a part is not what its name says."""
@@ -124,6 +134,18 @@ class Stored(NamedTuple):
             whole[slot : slot + n] = rows[:n]
             whole[: len(rows) - n] = rows[n:]
         return whole
+
+
+def names(tree: PyTree) -> set[str]:
+    """The paths of all numbers of all replay buffers in `tree`."""
+    nodes = tree_flatten_with_path(tree, is_leaf=lambda node: isinstance(node, Replay))[0]
+    return {
+        keystr((*path, *at))
+        for path, node in nodes
+        if isinstance(node, Replay)
+        for at, leaf in tree_flatten_with_path(node)[0]
+        if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    }
 
 
 def rings(tree: PyTree) -> list[Ring]:

@@ -1,6 +1,8 @@
 """A process that trains one run after another: a job per line of JSON in, an answer per line out.
 Started by `executor`; it ends when its input does."""
 
+import contextlib
+import ctypes
 import json
 import os
 import pathlib
@@ -8,26 +10,68 @@ import signal
 import sys
 import threading
 import time
+from typing import Any
+
+OPTIONS = (
+    "generations",
+    "frames",
+    "stop_at",
+    "wall_clock",
+    "checkpoint_every",
+    "keep",
+    "tensorboard",
+)
+GRACE = 60.0  # seconds to save in, once the parent is gone
+PR_SET_PDEATHSIG = 1
+
+
+def command(core: int) -> list[str]:
+    """What starts a worker. Its path is the parent's, as JSON: a folder may have a colon in its
+    name, and a script may have added to the path."""
+    path = [os.path.abspath(entry) for entry in sys.path if entry or os.path.exists(".")]
+    start = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
+    start += "import credo.runs.worker as worker; worker.main(int(sys.argv[2]))"
+    return [sys.executable, "-c", start, json.dumps(path), str(core)]
 
 
 def _end_with_parent(parent: int) -> None:
-    """Save and end when the parent is gone: nobody would read the answer."""
+    """Save and end when the parent is gone: nobody would read the answer. Whatever this process
+    started goes with it."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE)
+    if os.getpgrp() == os.getpid():  # the group is ours alone
+        os.killpg(0, signal.SIGKILL)
+    os._exit(128 + signal.SIGTERM)
 
 
-def main() -> None:
+def _ask_for_death(parent: int) -> None:
+    """Have the system send SIGTERM when the parent dies: on Linux at once, elsewhere within the
+    second that `_end_with_parent` sleeps."""
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    if os.getppid() != parent:  # it died before it was asked for
+        raise SystemExit(128 + signal.SIGTERM)
+
+
+def main(core: int) -> None:
     if hasattr(os, "sched_setaffinity"):  # not on macOS
-        os.sched_setaffinity(0, {int(sys.argv[1])})  # before JAX counts its threads
-    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
-    sys.path.insert(0, os.getcwd())
+        os.sched_setaffinity(0, {core})  # before JAX counts its threads
+    parent = os.getppid()
+    _ask_for_death(parent)
+    threading.Thread(target=_end_with_parent, args=(parent,), daemon=True).start()
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever prints must not look like an answer
 
     import jax
 
-    from . import config, loop
+    from . import loop
+
+    def answer(told: dict[str, Any]) -> None:
+        answers.write(json.dumps(told) + "\n")
+        answers.flush()
 
     before = None
     for line in sys.stdin:
@@ -35,36 +79,24 @@ def main() -> None:
         if job["algorithm"] != before:
             jax.clear_caches()  # programs of an earlier cell would pile up
             before = job["algorithm"]
-        path = pathlib.Path(job["path"])
         try:
-            options = {
-                name: job[name]
-                for name in (
-                    "generations",
-                    "frames",
-                    "stop_at",
-                    "wall_clock",
-                    "checkpoint_every",
-                    "keep",
-                    "tensorboard",
-                )
-            }
-            if (path / "config.json").exists():
-                loop.resume(path, progress=False, **options)
-            else:
-                algorithm = config.from_tree(job["algorithm"])
-                start = {"seed": job["seed"], "warm_start": job["warm_start"]}
-                loop.train(algorithm, path=path, progress=False, **start, **options)
-            answer = {"ok": str(path)}
+            _train(job)
+            answer({"ok": job["path"]})
         except loop.Interrupted as stop:
-            answers.write(json.dumps({"error": str(stop)}) + "\n")
-            answers.flush()
+            answer({"error": str(stop)})
             raise SystemExit(stop.code) from None
         except Exception as error:  # the parent reports it; the next job may still succeed
-            answer = {"error": f"{type(error).__name__}: {error}"}
-        answers.write(json.dumps(answer) + "\n")
-        answers.flush()
+            answer({"error": f"{type(error).__name__}: {error}"})
 
 
-if __name__ == "__main__":
-    main()
+def _train(job: dict[str, Any]) -> None:
+    from . import config, loop
+
+    path, options = pathlib.Path(job["path"]), {name: job[name] for name in OPTIONS}
+    if (path / "config.json").exists():
+        # Its settings are those of the job, which the parent named (`Job.finished`).
+        loop.resume(path, trust=True, progress=False, **options)
+    else:
+        algorithm = config.from_tree(job["algorithm"])
+        start = {"seed": job["seed"], "warm_start": job["warm_start"]}
+        loop.train(algorithm, path=path, progress=False, **start, **options)

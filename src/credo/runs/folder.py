@@ -1,0 +1,116 @@
+"""The folder of a run: who may have it, and what is left of it when a run fails to begin."""
+
+import contextlib
+import os
+import pathlib
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from . import files
+from .lock import lock
+from .record import NAME, RunError
+
+DRAFT = re.compile(r"\.config\.json\.draft(\.json)?")
+FIRST = re.compile(r"\.?0{8}[\w.-]*")  # the checkpoint of generation 0, finished or not
+PART = re.compile(r"\.?(state\.safetensors|counters\.json|COMMIT|replay\d[\w.-]*)(\.draft\w*)?")
+
+
+def runs_in(path: str | pathlib.Path) -> list[pathlib.Path]:
+    """The run at `path`, or all runs directly inside it, as `--seeds` makes them. Raises `RunError`
+    if there is none."""
+    path = pathlib.Path(path)
+    if os.path.lexists(path / NAME):
+        return [path]
+    inside = [file.parent for file in path.glob(f"*/{NAME}")]
+    if not inside:
+        raise RunError(
+            f"{path} is no run and has none in it: name a folder that `credo train` made, with "
+            "--seeds or without"
+        )
+    number = re.compile(r"\d+")  # seed-2 comes before seed-10
+    return sorted(inside, key=lambda run: number.sub(lambda m: m[0].zfill(20), run.name))
+
+
+def free_name(algorithm: Any, seed: int | str, label: str = "") -> pathlib.Path:
+    """A folder that does not exist. `label`: what stands before the seed; by default the names of
+    the algorithm and the task."""
+    label = label or f"{type(algorithm).__name__}-{type(algorithm.env).__name__}"
+    name = re.sub(r"[^\w.]+", "-", f"{label}-{seed}".lower())
+    path, copies = pathlib.Path("runs") / name, 1
+    while path.exists():
+        copies += 1
+        path = pathlib.Path("runs") / f"{name}-{copies}"
+    return path
+
+
+@contextlib.contextmanager
+def new_folder(path: pathlib.Path) -> Iterator[None]:
+    """Own a new or empty folder for a run. If none comes to be in it, all is as it was before."""
+    _refuse_occupied(path)
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    locked = (path / "lock").exists()
+    try:
+        with lock(path):
+            _refuse_occupied(path)  # another process may have been quicker
+            begun = os.path.lexists(path / "checkpoints")
+            try:
+                yield
+            except BaseException:
+                if not (path / NAME).exists() and not begun:
+                    files.remove(path / "checkpoints")
+                raise
+    except BaseException:
+        if not (path / NAME).exists():
+            with contextlib.suppress(OSError):  # something else may lie there by now
+                if not locked:
+                    files.remove(path / "lock")
+                for folder in made:
+                    folder.rmdir()
+        raise
+
+
+def _leftover(path: pathlib.Path) -> bool:
+    """Whether all that is in a folder was left by a process of ours that died before its run began:
+    nothing but the first checkpoint, or less, and what holds the folder meanwhile."""
+    for entry in path.iterdir():
+        if entry.name == "lock" or DRAFT.fullmatch(entry.name):
+            ours = entry.is_file() and not entry.is_symlink()
+        else:
+            ours = entry.name == "checkpoints" and _holds(entry, _first_checkpoint)
+        if not ours:
+            return False
+    return True
+
+
+def _first_checkpoint(path: pathlib.Path) -> bool:
+    return FIRST.fullmatch(path.name) is not None and _holds(
+        path, lambda file: bool(PART.fullmatch(file.name)) and file.is_file()
+    )
+
+
+def _holds(path: pathlib.Path, ours: Callable[[pathlib.Path], bool]) -> bool:
+    """Whether `path` is a folder of which every entry is one of ours, and none is a link."""
+    if path.is_symlink() or not path.is_dir():
+        return False
+    return all(ours(entry) and not entry.is_symlink() for entry in path.iterdir())
+
+
+def _refuse_occupied(path: pathlib.Path) -> None:
+    """Raise unless a new run can have this folder: nothing in it is ever removed."""
+    if not os.path.lexists(path):
+        return
+    if not path.is_dir():
+        raise RunError(f"{path} is no folder: choose another path for the run")
+    if os.path.lexists(path / NAME):
+        raise RunError(
+            f"{path} holds a run already: `credo resume {path}` goes on with it; choose another "
+            "path for a new one"
+        )
+    if not _leftover(path):
+        names = sorted(os.listdir(path))
+        more = ", …" if len(names) > 3 else ""
+        raise RunError(
+            f"{path} is not empty and no run of Credo's (it holds {', '.join(names[:3])}{more}): "
+            "give a new or an empty folder"
+        )

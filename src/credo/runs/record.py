@@ -1,0 +1,239 @@
+"""A run's config.json: read, checked and written in one place.
+
+    algorithm   the object tree, as `config.to_tree` records it
+    seed        everything random follows from it
+    budget      limits of generations, frames and score
+    machine     versions, processor, cores, device and system at the start
+    task        sizes and actions of the task at the start, and the folder it was found from
+    warm_start  the run whose champion this one started from
+    changes     what was changed on the way: budgets, settings
+    resumable   false if a class was defined in a notebook
+    sha256      of all the others: it finds what was changed by hand or by a disk
+    signature   of the user who made it (see `trust`)
+
+Older versions wrote algorithm, seed, budget, machine and warm_start alone.
+"""
+
+import json
+import os
+import pathlib
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from . import files, trust
+
+NAME, CHECKSUM = "config.json", "sha256"
+SIZES = {
+    "obs_size": "numbers in an observation",
+    "action_size": "numbers in an action",
+    "agents": "agents of a team",
+}
+CLASS = re.compile(r"[^\W\d]\w*(\.\w+)*:[^\W\d]\w*")
+
+
+class RunError(RuntimeError):
+    """A run that cannot start, go on or be read; the message says what to do."""
+
+
+class Record(dict[str, Any]):
+    """What config.json says. A name that is asked for and not there is a damaged file."""
+
+    path: pathlib.Path
+
+    def __missing__(self, name: str):
+        raise RunError(f"{self.path} is damaged: it has no {name!r}; restore it from a copy")
+
+
+def read(folder: pathlib.Path) -> Record:
+    """The record of the run in `folder`. Raises `RunError`, which names the file."""
+    path = folder / NAME
+    if not os.path.lexists(path):
+        raise RunError(
+            f"{folder} is not a run: it has no {NAME}; name a folder that `credo train` made"
+        )
+    try:
+        content = json.loads(files.read_text(path))
+    except OSError as error:
+        raise RunError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        told = str(error) if str(path) in str(error) else f"{path} is damaged: {error}"
+        raise RunError(f"{told}; restore it from a copy") from error
+    if not isinstance(content, dict):
+        raise RunError(f"{path} is damaged: it is no JSON object; restore it from a copy")
+    for name, (right, what) in FIELDS.items():
+        if name in content and not right(content[name]):
+            raise RunError(
+                f"{path} is damaged: {name!r} is {_brief(content[name])}: it must be {what}; "
+                "restore it from a copy"
+            )
+    if content.get(CHECKSUM, _checksum(content)) != _checksum(content):
+        raise RunError(
+            f"{path} was changed after Credo wrote it (its checksum says so): restore it from a "
+            "copy. The settings of a run are changed by `credo resume RUN --set NAME=VALUE`, its "
+            "budget by --generations and --frames"
+        )
+    record = Record(content)
+    record.path = path
+    return record
+
+
+def write(folder: pathlib.Path, record: dict[str, Any]) -> None:
+    """Write config.json, with a checksum and this user's signature."""
+    said = {k: v for k, v in record.items() if k not in (CHECKSUM, trust.SIGNATURE)}
+    record = said | {CHECKSUM: _checksum(said)}
+    signature = trust.sign(record)
+    files.write_json(folder / NAME, record | ({trust.SIGNATURE: signature} if signature else {}))
+
+
+def stranger(record: Mapping[str, Any], sealed: Any) -> str | None:
+    """How a champion or checkpoint with this seal (`trust.seal`) is not of this run, in words; None
+    if it is, or was written by a version that sealed nothing."""
+    if not isinstance(sealed, Mapping):
+        return None
+    ours = trust.seal(record)
+    if sealed.get("seed") != ours["seed"]:
+        return (
+            f"it was written for a run with seed {sealed.get('seed')}, this one has {ours['seed']}"
+        )
+    before = {change.get("before") for change in record.get("changes", [])}
+    if sealed.get("algorithm") not in {ours["algorithm"], *before}:
+        return "it was written for a run with another algorithm, task or settings"
+    return None
+
+
+def task_of(env: Any) -> dict[str, Any]:
+    """What a record says of a task: its sizes, what its actions are outside JAX, and from which
+    folder it was found."""
+    told, inner = None, env
+    while told is None and inner is not None:  # a delayed task is still that task
+        told = getattr(inner, "task_record", None)
+        inner = getattr(inner, "env", None)
+    told = told() if callable(told) else told
+    try:
+        folder = os.fsencode(os.getcwd()).decode(errors="replace")
+    except OSError:  # it was removed
+        folder = None
+    sizes = {name: getattr(env, name, None) for name in (*SIZES, "discrete")}
+    sizes["discrete"] = bool(sizes["discrete"])
+    return {**sizes, "actions": None, "observations": None} | dict(told or {}) | {"folder": folder}
+
+
+def check_task(record: Mapping[str, Any], env: Any) -> None:
+    """Raise `RunError` if a task is not the one that a run began with: `env` has other sizes than
+    were recorded. It opens a task outside JAX."""
+    recorded, name = record.get("task", {}), task_name(env)
+    for size, what in SIZES.items():
+        if size not in recorded:
+            continue
+        then, now = recorded[size], getattr(env, size, None)
+        if then != now:
+            raise RunError(
+                f"{name} has {_count(now)} {what} today and {_count(then)} when this run began: "
+                "give it back what it had, or start a new run"
+            )
+    if "discrete" in recorded and recorded["discrete"] != bool(getattr(env, "discrete", False)):
+        kinds = {False: "Box", True: "Discrete"}
+        then, now = kinds[bool(recorded["discrete"])], kinds[not recorded["discrete"]]
+        raise RunError(f"{name} has {now} actions today and {then} ones when this run began")
+
+
+def task_name(env: Any) -> str:
+    """What people call a task: its id, or its class."""
+    while getattr(env, "id", None) is None and getattr(env, "env", None) is not None:
+        env = env.env
+    return getattr(env, "id", None) or type(env).__name__
+
+
+def home(record: Mapping[str, Any]) -> str:
+    """Where to go for a task that cannot be found from here, as the end of a sentence."""
+    folder = record.get("task", {}).get("folder")
+    here = task_of(None)["folder"]
+    return f". It began in {folder}: start credo there" if folder not in (None, here) else ""
+
+
+def _count(size: int | None) -> str:
+    return "no" if size is None else str(size)
+
+
+def _checksum(content: dict[str, Any]) -> str:
+    left_out = (CHECKSUM, trust.SIGNATURE)
+    return trust.short({k: v for k, v in content.items() if k not in left_out})
+
+
+def _brief(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else text[:60] + "…"
+
+
+# What each field must be.
+
+
+def _number(value: Any, least: float = -float("inf")) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and not value < least
+
+
+def _whole(value: Any, least: int, most: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+
+
+def _is_object(value: Any) -> bool:
+    return isinstance(value, dict) and bool(CLASS.fullmatch(str(value.get("class"))))
+
+
+def _is_algorithm(value: Any) -> bool:
+    return _is_object(value) and _is_object(value.get("env"))
+
+
+def _is_budget(value: Any) -> bool:
+    if not isinstance(value, dict) or set(value) - {"generations", "frames", "stop_at"}:
+        return False
+    limits = [value[name] for name in ("generations", "frames") if value.get(name) is not None]
+    score = value.get("stop_at")
+    whole = all(_whole(limit, 1, 2**63) for limit in limits)
+    return bool(limits) and whole and (score is None or _number(score))
+
+
+def _is_machine(value: Any) -> bool:
+    if not isinstance(value, dict):
+        return False
+    texts = [value.get(name, "") for name in ("processor", "device", "system")]
+    versions = value.get("versions", {})
+    if not isinstance(versions, dict):
+        return False
+    named = all(isinstance(text, str) for text in [*texts, *versions.values()])
+    return named and _whole(value.get("cores", 1), 0, 2**31)
+
+
+def _is_task(value: Any) -> bool:
+    if not isinstance(value, dict):
+        return False
+    sizes = [value[name] for name in ("obs_size", "action_size", "agents") if name in value]
+    folder = value.get("folder")
+    known = all(size is None or _whole(size, 0, 2**31) for size in sizes)
+    return known and (folder is None or isinstance(folder, str))
+
+
+def _is_changes(value: Any) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(change, dict) and _whole(change.get("generation"), 0, 2**63) for change in value
+    )
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+FIELDS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "algorithm": (_is_algorithm, 'an object with "class" and "env"'),
+    # Older versions took seeds that JAX cuts to 32 bits.
+    "seed": (lambda value: _whole(value, -(2**63), 2**63 - 1), "a whole number"),
+    "budget": (_is_budget, "generations and frames, whole numbers of at least 1, and stop_at"),
+    "machine": (_is_machine, "versions, processor, cores, device and system"),
+    "task": (_is_task, "the sizes of the task and the folder it was found from"),
+    "warm_start": (_is_text, "the path of a run"),
+    "changes": (_is_changes, "a list of objects, each with a generation"),
+    "resumable": (lambda value: isinstance(value, bool), "true or false"),
+    CHECKSUM: (_is_text, "a text"),
+    trust.SIGNATURE: (_is_text, "a text"),
+}

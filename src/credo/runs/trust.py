@@ -1,0 +1,132 @@
+"""Who made a run: records signed with a key of the user's own, and short hashes of what they say.
+
+A run's config.json can name classes of somebody's own, and to import a module is to execute it. A
+record that this user's Credo wrote is signed with a key in the user's own folder, so that such a
+run goes on without a word; one from elsewhere must be trusted first. Nothing random enters what a
+run computes: champions and checkpoints hold hashes alone.
+"""
+
+import contextlib
+import hashlib
+import hmac
+import json
+import os
+import pathlib
+import secrets
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+from . import files
+
+SIZE = 32  # bytes of a key
+SIGNATURE = "signature"
+
+
+def canonical(value: Any) -> bytes:
+    """JSON that is the same for equal values, whatever the order of their keys."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
+
+
+def short(value: Any) -> str:
+    """64 bits of the SHA-256 of a JSON value."""
+    return hashlib.sha256(canonical(value)).hexdigest()[:16]
+
+
+def seal(record: Mapping[str, Any]) -> dict[str, Any]:
+    """What a champion and a checkpoint say of the run that they belong to. Nothing in it is random,
+    and each part stands alone, so that a message can say which one differs."""
+    return {
+        "algorithm": short(record["algorithm"]),
+        "seed": record["seed"],
+        "budget": record.get("budget"),
+        "versions": short(record.get("machine", {}).get("versions")),
+    }
+
+
+def digest(record: Mapping[str, Any]) -> str:
+    """SHA-256 of a run's algorithm, seed and versions: of all but its budget, which may grow."""
+    parts = seal(record)
+    del parts["budget"]
+    return hashlib.sha256(canonical(parts)).hexdigest()
+
+
+def sign(record: Mapping[str, Any]) -> str | None:
+    """HMAC-SHA256 of all that a record says but its signature; None if there can be no key."""
+    key = _key(make=True)
+    return None if key is None else _code(record, key)
+
+
+def signed_here(record: Mapping[str, Any]) -> bool:
+    """Whether this user's key signed the record as it is now."""
+    given, key = record.get(SIGNATURE), _key(make=False)
+    if key is None or not isinstance(given, str):
+        return False
+    return hmac.compare_digest(given.encode(), _code(record, key).encode())
+
+
+def key_path() -> pathlib.Path | None:
+    """Where this user's key lies; None if the user has no folder."""
+    base = os.environ.get("XDG_CONFIG_HOME")
+    if base and os.path.isabs(base):
+        return pathlib.Path(base) / "credo" / "key"
+    try:
+        home = pathlib.Path.home()
+    except RuntimeError:  # no HOME, and nobody knows this user
+        return None
+    return home / ".config" / "credo" / "key" if home.is_absolute() else None
+
+
+def _code(record: Mapping[str, Any], key: bytes) -> str:
+    said = {name: value for name, value in record.items() if name != SIGNATURE}
+    return hmac.new(key, canonical(said), hashlib.sha256).hexdigest()
+
+
+def _key(*, make: bool) -> bytes | None:
+    path = key_path()
+    if path is None:
+        return _none("this user has no home folder") if make else None
+    try:
+        if make and not path.exists():
+            _make(path)
+        return _read(path)
+    except (OSError, ValueError) as error:
+        return _none(str(error)) if make else None
+
+
+def _read(path: pathlib.Path) -> bytes:
+    """The key, if it is nobody else's to know or to choose."""
+    status = os.stat(path)
+    if hasattr(os, "geteuid") and status.st_uid != os.geteuid():
+        raise ValueError(f"{path} belongs to somebody else")
+    if status.st_mode & 0o077:
+        raise ValueError(f"{path} can be read or written by others: `chmod 600 {path}`")
+    key = files.read_bytes(path, most=SIZE)
+    if len(key) != SIZE:
+        raise ValueError(f"{path} has {len(key)} bytes, not {SIZE}: remove it")
+    return key
+
+
+def _make(path: pathlib.Path) -> None:
+    """A new key, unless another process makes one at the same time."""
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    files.remove(draft)
+    try:
+        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with open(descriptor, "wb") as file:
+            file.write(secrets.token_bytes(SIZE))
+            file.flush()
+            os.fsync(descriptor)
+        with contextlib.suppress(FileExistsError):
+            os.link(draft, path)
+    finally:
+        files.remove(draft)
+
+
+def _none(why: str) -> None:
+    warnings.warn(
+        f"runs made now are not signed, since there is no key for it ({why}): those with classes "
+        "of your own will go on only with --trust",
+        stacklevel=2,
+    )
