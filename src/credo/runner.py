@@ -12,35 +12,43 @@ import hashlib
 import json
 import math
 import pathlib
+import stat
 import struct
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
-VERSION = 1  # of the description
+VERSION = 2  # of the description; files of version 1, which knew one network each, are read too
 DESCRIPTION, FINGERPRINT = "credo.policy", "credo.sha256"  # their names in the metadata
 EPSILON = 1e-6  # of LayerNorm, relative to the variance
+LARGEST = 2**30  # bytes of a file
+DEEPEST = 8  # networks within networks
+MOST_AGENTS = 10_000
 
 Weights = dict[str, np.ndarray]
-Shapes = dict[str, tuple[int, ...]]
 
 
 class Runner:
     """A policy that acts. Its memory, if it has one, is kept between calls."""
 
     def __init__(self, description: dict[str, Any], weights: Weights):
-        if description["version"] != VERSION:
+        if description["version"] not in (1, VERSION):
             raise ValueError(
-                f"it has format {description['version']}, and this runner reads {VERSION}: use "
-                f"the runner of Credo {description['credo']}, which wrote it"
+                f"it has format {description['version']}, and this runner reads 1 and {VERSION}: "
+                f"use the runner of Credo {description['credo']}, which wrote it"
             )
-        self.description = description
-        self.obs_size, self.action_size = description["obs_size"], description["action_size"]
-        network = NETWORKS[description["network"]]
-        _check(weights, network.shapes(description["config"], self.obs_size, self.action_size))
-        self._network = network(description["config"], weights)
-        self._units = _units(description["action"])
-        self.reset()
+        if description["version"] == 1:
+            network = {"type": description["network"], "config": description["config"]}
+            description = description | {"network": network}
+        self.description, self._units = description, Units(description)
+        self.obs_size, self.action_size = self._units.obs_size, self._units.action_size
+        self.agents = self._units.agents  # None: it is no team
+        claim = Claim(weights)
+        sizes = (self.obs_size, self.action_size, self.agents)
+        self._network = build(description["network"], claim, *sizes)
+        claim.all_claimed()
+        self._try()
 
     @classmethod
     def load(cls, path: Any) -> "Runner":
@@ -48,6 +56,9 @@ class Runner:
 
         **Raises:** `ValueError` if the file is anything else or a bit of it has changed.
         """
+        status = pathlib.Path(path).stat()
+        if not stat.S_ISREG(status.st_mode) or status.st_size > LARGEST:
+            raise ValueError(f"{path} is no file of at most {LARGEST} bytes: name a policy's file")
         data = pathlib.Path(path).read_bytes()
         try:
             return cls(*_parse(data))
@@ -57,44 +68,211 @@ class Runner:
                 f"({type(error).__name__}: {error}): export it again"
             ) from error
 
-    def reset(self) -> None:
-        """Forget: call at the start of every episode."""
-        self._memory = self._network.start()
+    def reset(self, seed: int = 0) -> None:
+        """Forget: call at the start of every episode. `seed` decides what a policy draws: of those
+        there are, only the agents' order of a DMMU with `order="random"`."""
+        self._memory = self._network.start(np.random.default_rng(seed))
 
-    def __call__(self, observation: Any) -> Any:
+    def __call__(self, observation: Any, mask: Any = None) -> Any:
         """What to do now.
 
-        **Arguments:** `observation`: `obs_size` numbers in an array of any shape.
+        **Arguments:**
+
+        - `observation`: `obs_size` numbers in an array of any shape, or in a Discrete its integer.
+          Of a team one for each agent, in order, None for one that is not there; or a dict by name
+          of those that are.
+        - `mask`: in a Discrete which of its entries are allowed; None: all.
 
         **Returns:** in a Box of Gymnasium an array of its shape, dtype and units; in a Discrete
-        an integer; for any other task `[action_size]`, float32 in [-1, 1].
+        an integer; for any other task `[action_size]`, float32 in [-1, 1]. Of a team a list of
+        these, None for an agent that is not there, or a dict if the observation is one; for a task
+        of Credo's `[agents, action_size]`.
         """
+        return self._units.act(observation, self._step, mask)
+
+    def _step(self, x: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):  # what is not finite is refused below
+            output, self._memory = self._network(x, self._memory)
+        return output
+
+    def _try(self) -> None:
+        """One step: what cannot act should fail now."""
+        team = () if self.agents is None else (self.agents,)
+        self.reset()
+        self._units.own(self._step(np.ones((*team, self.obs_size), np.float32)), None)
+        self.reset()
+
+
+# -------------------------------------------------------------------------------------- units
+
+
+class Units:
+    """Between a task and its policy: observations as float32 rows, actions in the task's units.
+
+    `task` has `obs_size`, `action_size`, `agents` (None: no team); `action` or `actions`: None for
+    [-1, 1], or a description of the action space, of a team one for each agent; and where they are
+    known `observations` ({"n", "start"} of a Discrete) and `names` of the agents.
+    """
+
+    def __init__(self, task: Mapping[str, Any]):
+        self.obs_size = _size("obs_size", task["obs_size"])
+        self.action_size = _size("action_size", task["action_size"])
+        agents, self.agents = task.get("agents"), None
+        if agents is not None:
+            self.agents = _size("agents", agents, MOST_AGENTS)
+        self.names = self._one_each("names", task.get("names"))
+        self._discrete = self._observed(task.get("observations"))
+        spaces = task.get("action", task.get("actions"))
+        self._own = None if spaces is None else self._scales(spaces)
+
+    def act(self, observation: Any, step: Callable[[np.ndarray], Any], mask: Any = None) -> Any:
+        """The action in the task's units that follows from `step`, a policy on float32 arrays."""
+        output = np.asarray(step(self.read(observation)))
+        if not np.isfinite(output).all():
+            raise ValueError(
+                f"the policy's output for {observation!r} is {output}: its weights, or numbers as "
+                "large as these, overflow"
+            )
+        own = self.own(output, mask)
+        if isinstance(observation, Mapping):
+            return {name: own[k] for k, name in enumerate(self.names) if name in observation}
+        if isinstance(own, list):
+            absent = [row is None for row in observation]
+            return [None if gone else action for gone, action in zip(absent, own, strict=True)]
+        return own
+
+    def read(self, observation: Any) -> np.ndarray:
+        """`[obs_size]`, of a team `[agents, obs_size]`, float32. Raises `ValueError`."""
+        if self.agents is None:
+            return self._row(observation, self._discrete)
+        if isinstance(observation, Mapping):
+            observation = self._by_name(observation)
+        if not isinstance(observation, np.ndarray | list | tuple) or (
+            len(observation) != self.agents
+        ):
+            raise ValueError(
+                f"the observation is {observation!r}: it must be that of each of {self.agents} "
+                "agents, in order, None for one that is not there"
+            )
+        rows = np.zeros((self.agents, self.obs_size), np.float32)
+        for k, row in enumerate(observation):
+            if row is not None:
+                row = self._row(row, self._discrete)
+                rows[k, : row.size] = row
+        return rows
+
+    def own(self, output: np.ndarray, mask: Any) -> Any:
+        """An action in [-1, 1] in the task's units."""
+        if self._own is None or self.agents is None:
+            if self._own is None and mask is not None:
+                raise ValueError("a mask was given: only a Discrete has entries to allow")
+            return output if self._own is None else self._own[0](output, mask)
+        masks = [None] * self.agents if mask is None else self._one_each("mask", mask)
+        return [own(row, mask) for own, row, mask in zip(self._own, output, masks, strict=True)]
+
+    def _row(self, observation: Any, discrete: Mapping[str, Any] | None) -> np.ndarray:
+        if discrete is not None and np.ndim(observation) == 0:
+            return _one_hot(observation, **discrete)
         x = np.asarray(observation, np.float32).ravel()
-        if x.size != self.obs_size:
+        # Teams of others are padded to the largest observation.
+        padded = self.agents is not None and self._own is not None
+        if x.size > self.obs_size or (x.size < self.obs_size and not padded):
             raise ValueError(f"the observation has {x.size} numbers: it must have {self.obs_size}")
         if not np.isfinite(x).all():
             # It would stay in the memory of a recurrent network for ever.
             raise ValueError(f"the observation is {x}: NaN and inf are no observations")
-        output, self._memory = self._network(x, self._memory)
-        return self._units(output)
+        return x
+
+    def _by_name(self, observation: Mapping[Any, Any]) -> list[Any]:
+        strangers = [name for name in observation if name not in (self.names or ())]
+        if strangers or self.names is None:
+            raise ValueError(
+                f"the observation names {strangers[:1] or 'nobody'}: this team has "
+                f"{self.names or 'no names, so give a row for each agent'}"
+            )
+        return [observation.get(name) for name in self.names]
+
+    def _one_each(self, what: str, values: Any) -> Any:
+        if values is not None and (self.agents is None or len(values) != self.agents):
+            raise ValueError(f"{what} is {values!r}: it must have one entry for each agent")
+        return values
+
+    def _observed(self, discrete: Any) -> Mapping[str, Any] | None:
+        if discrete is None or self.agents is not None:
+            return None
+        n, start = discrete["n"], discrete["start"]
+        if n != self.obs_size or type(start) is not int:
+            raise ValueError(f"observations are {discrete}: n must be {self.obs_size}")
+        return {"n": n, "start": start}
+
+    def _scales(self, spaces: Any) -> list[Callable[[np.ndarray, Any], Any]]:
+        spaces = [spaces] if self.agents is None else self._one_each("actions", spaces)
+        return [_scale(space, self.action_size, self.agents is None) for space in spaces]
 
 
-def _units(action: Any) -> Any:
-    """What turns an action in [-1, 1] into the task's own."""
-    if action is None:
-        return lambda output: output
-    if "n" in action:
-        return lambda output: int(np.argmax(output)) + action["start"]
-    low, high = np.array(action["low"], np.float64), np.array(action["high"], np.float64)
-    center, half = (low + high) / 2, (high - low) / 2
-    shape, dtype = action["shape"], np.dtype(action["dtype"])
-    whole = not np.issubdtype(dtype, np.floating)
+def _size(what: str, n: Any, most: int | None = None) -> int:
+    if type(n) is not int or n < 1 or (most is not None and n > most):
+        bounds = "of at least 1" if most is None else f"from 1 to {most}"
+        raise ValueError(f"{what} is {n!r}: it must be a whole number {bounds}")
+    return n
 
-    def scale(output: np.ndarray) -> np.ndarray:
-        own = np.minimum(np.maximum(center + half * output, low), high)
+
+def _one_hot(observation: Any, n: int, start: int) -> np.ndarray:
+    entry = np.asarray(observation)
+    if entry.dtype.kind not in "iu" or not start <= entry < start + n:
+        raise ValueError(
+            f"the observation is {observation!r}: it must be an integer from {start} to "
+            f"{start + n - 1}"
+        )
+    return (np.arange(start, start + n) == entry).astype(np.float32)
+
+
+def _scale(space: Any, action_size: int, alone: bool) -> Callable[[np.ndarray, Any], Any]:
+    """What turns an action in [-1, 1], and a mask of a Discrete or None, into a space's own. In a
+    team a space may be smaller than the largest: it takes as much of the action as it holds."""
+    if "n" in space:
+        size, start = _size("n", space["n"]), space["start"]
+        if type(start) is not int:
+            raise ValueError(f"start is {start!r}: it must be an integer")
+        read = _largest(size, start)
+    else:
+        size, read = _box(space)
+    if size > action_size or (alone and size < action_size):
+        raise ValueError(f"an action has {size} numbers in its space, and {action_size} as such")
+    return read
+
+
+def _largest(n: int, start: int) -> Callable[[np.ndarray, Any], int]:
+    def choose(output: np.ndarray, mask: Any) -> int:
+        output = output[:n]
+        if mask is not None:
+            mask = np.asarray(mask, np.bool_).ravel()
+            if mask.size != n or not mask.any():
+                raise ValueError(f"the mask is {mask}: it must allow at least one of {n} entries")
+            output = np.where(mask, output, -np.inf)
+        return int(np.argmax(output)) + start
+
+    return choose
+
+
+def _box(space: Any) -> tuple[int, Callable[[np.ndarray, Any], np.ndarray]]:
+    low, high = np.array(space["low"], np.float64), np.array(space["high"], np.float64)
+    shape, dtype = tuple(space["shape"]), np.dtype(space["dtype"])
+    bounded = np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()
+    if low.ndim != 1 or low.shape != high.shape or math.prod(shape) != low.size or not bounded:
+        raise ValueError(f"its action space has low {low}, high {high} and shape {shape}")
+    if dtype.kind not in "fiu":
+        raise ValueError(f"its action space has dtype {dtype}: it must be one of numbers")
+    center, half, size = (low + high) / 2, (high - low) / 2, low.size
+    whole = dtype.kind != "f"
+
+    def scale(output: np.ndarray, mask: Any) -> np.ndarray:
+        if mask is not None:
+            raise ValueError("a mask was given: only a Discrete has entries to allow")
+        own = np.minimum(np.maximum(center + half * output[:size], low), high)
         return (np.rint(own) if whole else own).astype(dtype).reshape(shape)
 
-    return scale
+    return size, scale
 
 
 # ----------------------------------------------------------------------------------- networks
@@ -119,66 +297,133 @@ def _act(x: np.ndarray, activation: str) -> tuple[np.ndarray, np.ndarray]:
     return y, 2.0 * y - 1.0 if activation == "sigmoid" else y
 
 
+class Claim:
+    """The arrays of a file, for networks to claim by name and shape."""
+
+    def __init__(self, weights: Weights, prefix: str = "", left: set[str] | None = None):
+        self._weights, self._prefix = weights, prefix
+        self._left = set(weights) if left is None else left
+
+    def __call__(self, name: str, *shape: int) -> np.ndarray:
+        name = self._prefix + name
+        array = self._weights.get(name)
+        sound = all(type(n) is int and n > 0 for n in shape)
+        if not sound or array is None or array.shape != shape or name not in self._left:
+            found = None if array is None else array.shape
+            raise ValueError(_mismatch(name, found, shape))
+        self._left.remove(name)
+        return array
+
+    def within(self, prefix: str) -> "Claim":
+        """Those whose names start so."""
+        return Claim(self._weights, f"{self._prefix}{prefix}.", self._left)
+
+    def all_claimed(self) -> None:
+        for name in sorted(self._left):
+            raise ValueError(_mismatch(name, self._weights[name].shape, None))
+
+
+def _mismatch(name: str, found: Any, expected: Any) -> str:
+    return f"its network does not have such weights: {name} has shape {found}, expected {expected}"
+
+
+def build(
+    node: Any, claim: Claim, x: int, y: int, agents: int | None = None, depth: int = 0
+) -> Any:
+    """The network that a description names, for `x` numbers in an observation and `y` in an
+    action, of a team for each agent."""
+    if depth >= DEEPEST:
+        raise ValueError(f"its networks lie in one another more than {DEEPEST} deep")
+    kind = NETWORKS[node["type"]]
+    if kind.team is not None and kind.team != (agents is not None):
+        raise ValueError(f"{node['type']} cannot act for {agents or 1} agents here")
+    if agents is None and not kind.parts:
+        return kind(node["config"], claim, x, y)
+    parts = node.get("parts", [])
+
+    def part(i: int, prefix: str, x: int, y: int, agents: int | None = None) -> Any:
+        return build(parts[i], claim.within(prefix), x, y, agents, depth + 1)
+
+    return kind(node["config"], claim, x, y, agents, part)
+
+
 class MLP:
     """`credo.networks.mlp`: `W_l`, `b_l` of each layer l, `g_l`, `s_l` of its LayerNorm."""
 
-    def __init__(self, config: dict[str, Any], weights: Weights):
-        self.config, self.weights = config, weights
+    team: ClassVar[bool | None] = False
+    parts: ClassVar[bool] = False
 
-    @staticmethod
-    def shapes(config: dict[str, Any], x: int, y: int) -> Shapes:
-        sizes, shapes = [x, *config["hidden"], y], {}
-        for i, units in enumerate(sizes[1:]):
-            shapes.update({f"W_{i}": (units, sizes[i]), f"b_{i}": (units,)})
-        if config["normalization"] != "none":
-            for i, units in enumerate(config["hidden"]):
-                shapes.update({f"g_{i}": (units,), f"s_{i}": (units,)})
-        return shapes
+    def __init__(self, config: dict[str, Any], claim: Claim, x: int, y: int):
+        self._hidden = Layers(config, claim, x)
+        self._depth = len(config["hidden"])
+        self._w = claim(f"W_{self._depth}", y, self._hidden.size)
+        self._b = claim(f"b_{self._depth}", y)
+        self._activation = config["output_activation"]
 
-    def start(self) -> None:
+    def start(self, random: "np.random.Generator") -> None:
         return None
 
     def __call__(self, x: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
-        w, c = self.weights, self.config
-        depth = len(c["hidden"])
-        for i in range(depth):
-            x = w[f"W_{i}"] @ x + w[f"b_{i}"]
-            if c["normalization"] == "before":
-                x = self._normalize(i, x)
-            x = ACTIVATIONS[c["activation"]](x)
-            if c["normalization"] == "after":
-                x = self._normalize(i, x)
-        return _act(w[f"W_{depth}"] @ x + w[f"b_{depth}"], c["output_activation"])[1], None
+        return _act(self._w @ self._hidden(x) + self._b, self._activation)[1], None
 
-    def _normalize(self, i: int, x: np.ndarray) -> np.ndarray:
-        x = x - np.mean(x)
-        x = x / np.sqrt(np.mean(np.square(x)) + np.float32(EPSILON))
-        return self.weights[f"g_{i}"] * x + self.weights[f"s_{i}"]
+
+class Layers:
+    """Hidden layers: those of an MLP, and a team's trunk."""
+
+    def __init__(self, config: dict[str, Any], claim: Claim, x: int):
+        self._normalization, self._layers = config["normalization"], []
+        self._activation = ACTIVATIONS[config["activation"]]
+        for i, units in enumerate(config["hidden"]):
+            layer = [claim(f"W_{i}", units, x), claim(f"b_{i}", units)]
+            if self._normalization != "none":
+                layer += [claim(f"g_{i}", units), claim(f"s_{i}", units)]
+            self._layers.append(layer)
+            x = units
+        self.size = x
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        for w, b, *norm in self._layers:
+            x = w @ x + b
+            if self._normalization == "before":
+                x = _normalize(x, *norm)
+            x = self._activation(x)
+            if self._normalization == "after":
+                x = _normalize(x, *norm)
+        return x
+
+
+def _normalize(x: np.ndarray, gain: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    x = x - np.mean(x)
+    x = x / np.sqrt(np.mean(np.square(x)) + np.float32(EPSILON))
+    return gain * x + shift
 
 
 class MMU:
     """`credo.networks.mmu`: Khadka (2019), equations 3.1-3.5. The memory is (y, m)."""
 
-    def __init__(self, config: dict[str, Any], weights: Weights):
-        self.config, self.weights = config, weights
+    team: ClassVar[bool | None] = False
+    parts: ClassVar[bool] = False
+
+    def __init__(self, config: dict[str, Any], claim: Claim, x: int, y: int):
+        self.config = config
+        self.weights = {name: claim(name, *shape) for name, shape in self._shapes(config, x, y)}
 
     @staticmethod
-    def shapes(config: dict[str, Any], x: int, y: int) -> Shapes:
+    def _shapes(config: dict[str, Any], x: int, y: int):
         h = config["hidden"]
         m = h if config["memory"] is None else config["memory"]
-        shapes = {"K_p": (h, x), "N_p": (h, m), "b_p": (h,), "Z_y": (y, h), "b_y": (y,)}
         for gate, size in (("i", h), ("r", h), ("w", m)):
-            shapes.update({f"K_{gate}": (size, x), f"R_{gate}": (size, y)})
-            shapes.update({f"N_{gate}": (size, m), f"b_{gate}": (size,)})
+            yield from ((f"K_{gate}", (size, x)), (f"R_{gate}", (size, y)))
+            yield from ((f"N_{gate}", (size, m)), (f"b_{gate}", (size,)))
+        yield from (("K_p", (h, x)), ("N_p", (h, m)), ("b_p", (h,)), ("Z_y", (y, h)), ("b_y", (y,)))
         if config["decoder"] == "learned":
-            shapes.update({"N_d": (h, m), "b_d": (h,)})
+            yield from (("N_d", (h, m)), ("b_d", (h,)))
         if config["encoder"] == "learned":
-            shapes.update({"Z_f": (m, h), "b_f": (m,)})
+            yield from (("Z_f", (m, h)), ("b_f", (m,)))
         if config["start_memory"] == "learned":
-            shapes["m_0"] = (m,)
-        return shapes
+            yield "m_0", (m,)
 
-    def start(self) -> tuple[np.ndarray, np.ndarray]:
+    def start(self, random: "np.random.Generator") -> tuple[np.ndarray, np.ndarray]:
         w = self.weights
         return np.zeros_like(w["b_y"]), w.get("m_0", np.zeros_like(w["b_w"]))
 
@@ -208,43 +453,157 @@ class MMU:
 class Recurrent:
     """`credo.networks.recurrent`: Elman RNN, GRU and LSTM. The memory is (h, c)."""
 
-    GATES = {"rnn": "h", "gru": "zrh", "lstm": "ifoc"}
+    team: ClassVar[bool | None] = False
+    parts: ClassVar[bool] = False
+    GATES: ClassVar[dict[str, str]] = {"rnn": "h", "gru": "zrh", "lstm": "ifoc"}
 
-    def __init__(self, config: dict[str, Any], weights: Weights):
-        self.config, self.weights = config, weights
+    def __init__(self, config: dict[str, Any], claim: Claim, x: int, y: int):
+        self.cell, self._activation, h = (
+            config["cell"],
+            config["output_activation"],
+            config["hidden"],
+        )
+        self.weights = {"Z_y": claim("Z_y", y, h), "b_y": claim("b_y", y)}
+        for gate in self.GATES[self.cell]:
+            shapes = {f"W_{gate}": (h, x), f"U_{gate}": (h, h), f"b_{gate}": (h,)}
+            self.weights |= {name: claim(name, *shape) for name, shape in shapes.items()}
 
-    @staticmethod
-    def shapes(config: dict[str, Any], x: int, y: int) -> Shapes:
-        h = config["hidden"]
-        shapes = {"Z_y": (y, h), "b_y": (y,)}
-        for gate in Recurrent.GATES[config["cell"]]:
-            shapes.update({f"W_{gate}": (h, x), f"U_{gate}": (h, h), f"b_{gate}": (h,)})
-        return shapes
-
-    def start(self) -> tuple[np.ndarray, np.ndarray]:
-        zeros = np.zeros(self.config["hidden"], np.float32)
+    def start(self, random: "np.random.Generator") -> tuple[np.ndarray, np.ndarray]:
+        zeros = np.zeros(self.weights["Z_y"].shape[1], np.float32)
         return zeros, zeros
 
     def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
-        (h, c), cell = memory, self.config["cell"]
-        if cell == "rnn":
+        h, c = memory
+        if self.cell == "rnn":
             h = np.tanh(self._gate("h", x, h))
-        elif cell == "gru":
+        elif self.cell == "gru":
             z, r = (_sigmoid(self._gate(name, x, h)) for name in "zr")
             h = z * h + (1.0 - z) * np.tanh(self._gate("h", x, r * h))
         else:
             i, f, o = (_sigmoid(self._gate(name, x, h)) for name in "ifo")
             c = f * c + i * np.tanh(self._gate("c", x, h))
             h = o * np.tanh(c)
-        output = self.weights["Z_y"] @ h + self.weights["b_y"]
-        return _act(output, self.config["output_activation"])[1], (h, c)
+        return _act(self.weights["Z_y"] @ h + self.weights["b_y"], self._activation)[1], (h, c)
 
     def _gate(self, name: str, x: np.ndarray, h: np.ndarray) -> np.ndarray:
         w = self.weights
         return w[f"W_{name}"] @ x + w[f"U_{name}"] @ h + w[f"b_{name}"]
 
 
-NETWORKS: dict[str, Any] = {"MLP": MLP, "MMU": MMU, "Recurrent": Recurrent}
+class Team:
+    """`credo.networks.team`: a head for each agent on a trunk, of each one or one for all. The
+    memory is that of each head."""
+
+    team: ClassVar[bool | None] = True
+    parts: ClassVar[bool] = True
+
+    def __init__(self, config: Any, claim: Claim, x: int, y: int, agents: int, part: Any):
+        own_trunks, own_heads = {
+            "trunk": (False, True),
+            "everything": (False, False),
+            "nothing": (True, True),
+        }[config["sharing"]]
+        layers = config | {"hidden": config["trunk"], "normalization": "none"}
+
+        def each(own: bool, made: Callable[[int], Any]) -> list[Any]:
+            return [made(k) for k in range(agents)] if own else [made(0)] * agents
+
+        self._trunks = each(own_trunks, lambda k: Layers(layers, claim.within(f"trunks.{k}"), x))
+        size = self._trunks[0].size
+        self._heads = each(own_heads, lambda k: part(k, f"heads.{k}", size, y))
+
+    def start(self, random: "np.random.Generator") -> list[Any]:
+        return [head.start(random) for head in self._heads]
+
+    def __call__(self, x: np.ndarray, memory: list[Any]) -> tuple[np.ndarray, list[Any]]:
+        agents = zip(self._trunks, self._heads, x, memory, strict=True)
+        told = [head(trunk(row), kept) for trunk, head, row, kept in agents]
+        return np.stack([action for action, _ in told]), [kept for _, kept in told]
+
+
+class DMMU:
+    """`credo.networks.dmmu`: agents around one memory, each an MMU or a recurrent network. The
+    memory is (what is private to each, m, the generator of random orders)."""
+
+    team: ClassVar[bool | None] = True
+    parts: ClassVar[bool] = True
+
+    def __init__(self, config: Any, claim: Claim, x: int, y: int, agents: int, part: Any):
+        # The last number says who takes part: 1 acts, 0 is busy, -1 is away.
+        self._least = {"everyone": None, "present": -0.5, "acting": 0.5}[config["access"]]
+        self._order, self._y = config["order"], y
+        if self._order not in ("sequential", "simultaneous", "random"):
+            raise ValueError(f"its order is {self._order!r}")
+        inputs = x if self._least is None else x - 1
+        self._agents = [part(i, f"agents.{i}", inputs, y) for i in range(agents)]
+        if not all(isinstance(agent, MMU | Recurrent) for agent in self._agents):
+            raise ValueError("its agents must be MMUs or recurrent networks")
+        # Of GRUs and Elman networks the state itself is shared, of LSTMs the cell.
+        self._swapped = [getattr(agent, "cell", "lstm") != "lstm" for agent in self._agents]
+
+    def start(self, random: "np.random.Generator") -> Any:
+        own, m = self._turned(0, self._agents[0].start(random))
+        return [np.zeros_like(own)] * len(self._agents), m, random
+
+    def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
+        (own, m, random), n = memory, len(self._agents)
+        own, after = list(own), m
+        there = np.ones(n, np.bool_) if self._least is None else x[:, -1] > self._least
+        inputs = x if self._least is None else x[:, :-1]
+        actions = np.zeros((n, self._y), np.float32)
+        for i in random.permutation(n) if self._order == "random" else range(n):
+            if there[i]:
+                read = m if self._order == "simultaneous" else after
+                actions[i], kept = self._agents[i](inputs[i], self._turned(i, (own[i], read)))
+                own[i], left = self._turned(i, kept)
+                after = after + (left - read) if self._order == "simultaneous" else left
+        return actions, (own, after, random)
+
+    def _turned(self, i: int, pair: Any) -> Any:
+        """Between (h, c) of an agent and (private, shared)."""
+        return pair[::-1] if self._swapped[i] else pair
+
+
+class Centralized:
+    """`credo.networks.team`: one network for all agents."""
+
+    team: ClassVar[bool | None] = True
+    parts: ClassVar[bool] = True
+
+    def __init__(self, config: Any, claim: Claim, x: int, y: int, agents: int, part: Any):
+        self._inner, self._agents = part(0, "policy", agents * x, agents * y), agents
+
+    def start(self, random: "np.random.Generator") -> Any:
+        return self._inner.start(random)
+
+    def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
+        action, memory = self._inner(x.ravel(), memory)
+        return action.reshape(self._agents, -1), memory
+
+
+class Normalized:
+    """`credo.networks.normalized`: observations with mean 0 and standard deviation 1, clipped to
+    [-10, 10], for the network within."""
+
+    team: ClassVar[bool | None] = None  # that of the network within
+    parts: ClassVar[bool] = True
+
+    def __init__(self, config: Any, claim: Claim, x: int, y: int, agents: int | None, part: Any):
+        self._mean, self._std = claim("mean", x), claim("std", x)
+        if not (self._std > 0).all():
+            raise ValueError(f"std is {self._std}: it must be more than 0")
+        self._inner = part(0, "policy", x, y, agents)
+
+    def start(self, random: "np.random.Generator") -> Any:
+        return self._inner.start(random)
+
+    def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
+        return self._inner(np.clip((x - self._mean) / self._std, -10.0, 10.0), memory)
+
+
+NETWORKS: dict[str, Any] = {
+    kind.__name__: kind for kind in (MLP, MMU, Recurrent, Team, DMMU, Centralized, Normalized)
+}
 
 
 # ----------------------------------------------------------------------------------- the file
@@ -302,13 +661,3 @@ def _tensors(header: dict[str, Any], data: bytes) -> Weights:
     if end != len(data):
         raise ValueError(f"{len(data) - end} bytes at its end belong to no array")
     return weights
-
-
-def _check(weights: Weights, shapes: Shapes) -> None:
-    found = {name: array.shape for name, array in weights.items()}
-    wrong = sorted(n for n in found.keys() | shapes.keys() if found.get(n) != shapes.get(n))
-    if wrong:
-        raise ValueError(
-            f"its network does not have such weights: {wrong[0]} has shape "
-            f"{found.get(wrong[0])}, expected {shapes.get(wrong[0])}"
-        )

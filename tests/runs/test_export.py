@@ -12,15 +12,19 @@ from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments import adapters
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.sequence_recall import SequenceRecall
+from credo.environments.simple_spread import SimpleSpread
 from credo.environments.wrappers import DelayedHostReward
 from credo.networks.base import ACTIVATIONS, AbstractNetwork, AbstractPolicy
+from credo.networks.dmmu import DMMU, ORDERS
 from credo.networks.mlp import MLP, NORMALIZATIONS
 from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
-from credo.runner import DESCRIPTION, Runner
+from credo.networks.team import Centralized, Team
+from credo.runner import DESCRIPTION, VERSION, Runner
 from credo.runs import checkpoint, config
-from credo.runs.export import export
+from credo.runs.export import export, parts_of
 from credo.runs.loop import Run, RunError
+from credo.runs.policy import Policy
 
 STEPS = 60
 NETWORKS = [
@@ -35,6 +39,17 @@ NETWORKS = [
     MMU(4, 6, alpha=1.0, encoder="learned", decoder="learned", decoder_activation="elu"),
     MMU(4, start_weights="saturated"),
     *(Recurrent(c, 4, o) for c in ("rnn", "gru", "lstm") for o in ("sigmoid", "tanh")),
+]
+AGENTS = 3
+HEADS = (MLP((), initializer="uniform"), MMU(3), Recurrent("gru", 3), Recurrent("lstm", 3))
+TEAMS = [
+    *(Team((5,), head, sharing) for head in HEADS for sharing in ("trunk", "nothing")),
+    *(Team((5, 4), head, "everything", "relu") for head in HEADS[:2]),
+    Team((), MMU(3), "nothing"),  # what CCEA drafts
+    *(DMMU(cell, 4, order=order) for cell in ("mmu", "lstm", "gru", "rnn") for order in ORDERS[:2]),
+    *(DMMU(cell, 4, access=a) for cell in ("mmu", "gru") for a in ("everyone", "acting")),
+    DMMU("mmu", (3, 4, 5), 4),
+    *(Centralized(network) for network in (MLP((6,)), MMU(4), Recurrent("rnn", 4))),
 ]
 
 
@@ -64,14 +79,33 @@ def plant(space):
     return Gymnasium("test_export:Plant", {"space": space}, max_episode_steps=5, in_process=True)
 
 
-def made(path, env, network, seed=0) -> Run:
-    """A run on disk whose champion has fresh weights."""
+def made(path, env, network, seed=0, action=None) -> Run:
+    """A run on disk whose champion has fresh weights. `action`: the space in its record."""
     path.mkdir()
     algorithm = Neuroevolution(env, network, population_size=10)
-    policy = network.init(env.obs_size, env.action_size, key=jax.random.key(seed))
+    policy = network.init(*env.sizes, key=jax.random.key(seed))
     checkpoint.export_policy(path / "champion.safetensors", policy)
-    config.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": seed})
-    return Run(path)
+    task = {name: getattr(env, name) for name in ("obs_size", "action_size", "agents", "discrete")}
+    task["actions"] = action and adapters._described(action)
+    record = {"algorithm": config.to_tree(algorithm), "seed": seed, "task": task}
+    config.write_json(path / "config.json", record)
+    return Run(path, trust=True)
+
+
+def loaded(policy, agents=None, obs_size=4, action_size=2) -> Runner:
+    """What a runner reads of a policy that was exported."""
+    network, weights = parts_of(policy)
+    sizes = {"obs_size": obs_size, "action_size": action_size, "agents": agents}
+    description = {"version": VERSION, "network": network, "action": None, **sizes}
+    return Runner(json.loads(json.dumps(description)), weights)
+
+
+def fleet(n=STEPS, size=4):
+    """Observations of a team, whose last number says who acts, is busy or away."""
+    random = np.random.default_rng(1)
+    obs = random.normal(size=(n, AGENTS, size)).astype(np.float32)
+    obs[..., -1] = random.integers(-1, 2, (n, AGENTS))
+    return obs
 
 
 def observations(n=STEPS, size=3):
@@ -91,6 +125,65 @@ def test_the_runner_acts_as_the_champion_over_an_episode(tmp_path, network):
     np.testing.assert_array_equal(again, theirs)
 
 
+@pytest.mark.parametrize("network", TEAMS, ids=str)
+def test_the_runner_acts_as_a_team_over_an_episode(network):
+    champion = network.init(4, 2, AGENTS, key=jax.random.key(0))
+    policy, act = Policy(champion), loaded(champion, AGENTS)
+    ours = np.array([policy(obs) for obs in fleet()])
+    theirs = np.array([act(obs) for obs in fleet()])
+    assert ours.shape == (STEPS, AGENTS, 2)
+    assert ours.std(axis=0).max(axis=1).min() > 1e-3  # everybody does something
+    np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-5)
+    act.reset()
+    np.testing.assert_array_equal([act(obs) for obs in fleet()], theirs)
+
+
+@pytest.mark.parametrize("cell", ["mmu", "gru"])
+def test_random_orders_are_drawn_by_numpy(cell):
+    """JAX's generator is not NumPy's: the same step, in orders that `reset(seed)` decides."""
+    champion = DMMU(cell, 4, order="random").init(4, 2, AGENTS, key=jax.random.key(0))
+    act, carry = loaded(champion, AGENTS), champion.start(key=jax.random.key(0))
+    act.reset(seed=7)
+    orders, seen = np.random.default_rng(7), set()
+    private, memory = list(carry.private), carry.memory
+    for obs in fleet(20):
+        expected, order = np.zeros((AGENTS, 2)), orders.permutation(AGENTS)
+        seen.add(tuple(order))
+        for i in order:
+            expected[i], private[i], memory = champion._one(
+                champion.agents[i], obs[i, :-1], private[i], memory, obs[i, -1] > -0.5
+            )
+        np.testing.assert_allclose(act(obs), expected, rtol=0, atol=1e-5)
+    assert len(seen) > 2
+
+
+def test_a_team_in_a_file_acts_in_each_agents_units_and_opens_nothing(tmp_path):
+    """Neither run nor policy imports what the run names: there is no such module."""
+    spread = SimpleSpread(agents=3)
+    run = made(tmp_path / "run", spread, Team((5,), MMU(3)))
+    env = {"class": "credo.environments.pettingzoo:PettingZoo", "id": "not_there:Crew"}
+    boxes = [
+        gymnasium.spaces.Box(-3.0, 1.0, (2,), np.float64),
+        gymnasium.spaces.Box(0, 9, (1,), np.int64),
+        gymnasium.spaces.Box(np.float32([[10.0, 20.0]]), np.float32([[20.0, 60.0]])),
+    ]
+    wrapped = {"class": "credo.environments.wrappers:DelayedHostReward", "env": env}
+    run.config["algorithm"]["env"] = wrapped
+    run.config["task"] |= {
+        "actions": [adapters._described(box) for box in boxes],
+        "names": ["a", "b", "c"],
+    }
+    policy, act = run.policy(), Runner.load(export(run, tmp_path / "p.safetensors"))
+    assert act.description["task"] == "not_there:Crew"
+    for rows in np.random.default_rng(0).normal(size=(20, 3, spread.obs_size)):
+        ours, theirs = policy(rows), act(rows)
+        for box, mine, other in zip(boxes, ours, theirs, strict=True):
+            assert box.contains(mine)
+            assert box.contains(other)
+            np.testing.assert_allclose(other, mine, rtol=0, atol=1e-5 * (box.high - box.low).max())
+        assert policy({"b": rows[1]})["b"] == act({"b": rows[1]})["b"]
+
+
 def test_without_reset_a_recurrent_network_remembers(tmp_path):
     run = made(tmp_path / "run", plant("unit"), Recurrent("gru", 4))
     act = Runner.load(export(run, tmp_path / "p.safetensors"))
@@ -101,14 +194,18 @@ def test_without_reset_a_recurrent_network_remembers(tmp_path):
 
 @pytest.mark.parametrize("space", ["box", "whole", "discrete"])
 def test_actions_are_those_that_the_worker_gives_the_environment(tmp_path, space):
-    run = made(tmp_path / "run", DelayedHostReward(plant(space)), MLP((5,)))
-    policy, act = run.policy(), Runner.load(export(run, tmp_path / "p.safetensors"))
-    _, read = adapters._actions(Plant.spaces[space])
-    expected = [read(policy(obs)[None])[0] for obs in observations()]
-    actions = [act(obs) for obs in observations()]
-    assert all(Plant.spaces[space].contains(action) for action in actions)
+    own = Plant.spaces[space]
+    run = made(tmp_path / "run", DelayedHostReward(plant(space)), MLP((5,)), action=own)
+    raw, act = run.policy(raw=True), Runner.load(export(run, tmp_path / "p.safetensors"))
+    read = adapters._actions(own)[1]
+    expected = [read(raw(obs)[None])[0] for obs in observations()]
+    actions, policy = [act(obs) for obs in observations()], run.policy()
+    assert all(own.contains(action) for action in actions)
     assert len(np.unique(actions)) > 1
     np.testing.assert_allclose(actions, expected, rtol=1e-5, atol=1e-5)
+    ours = [policy(obs) for obs in observations()]
+    np.testing.assert_allclose(ours, expected, rtol=1e-6)
+    assert all(own.contains(action) for action in ours)
 
 
 def test_a_task_of_ours_keeps_actions_between_minus_one_and_one(tmp_path):
@@ -123,15 +220,17 @@ def test_a_task_of_ours_keeps_actions_between_minus_one_and_one(tmp_path):
 
 
 def test_the_file_says_what_it_is(tmp_path):
-    path = export(made(tmp_path / "run", plant("box"), MLP((5,))), tmp_path / "p.safetensors")
+    run = made(tmp_path / "run", plant("box"), MLP((5,)), action=Plant.spaces["box"])
+    path = export(run, tmp_path / "p.safetensors")
     with safe_open(path, "numpy") as file:  # the format's own library reads it
         assert sorted(file.keys()) == ["W_0", "W_1", "b_0", "b_1"]
         assert file.get_tensor("W_0").shape == (5, 3)
         description = json.loads(file.metadata()[DESCRIPTION])
-    assert description["version"] == 1
+    assert description["version"] == 2
     assert description["task"] == "test_export:Plant"
-    assert description["network"] == "MLP"
-    assert description["config"]["hidden"] == [5]
+    assert description["network"]["type"] == "MLP"
+    assert description["network"]["config"]["hidden"] == [5]
+    assert description["network"]["parts"] == []
     assert (description["obs_size"], description["action_size"]) == (3, 2)
     assert description["action"] == {
         "low": [-3.0, 10.0],

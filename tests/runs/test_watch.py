@@ -4,22 +4,29 @@ import os
 import re
 import subprocess
 import sys
+from typing import ClassVar
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from pettingzoo import ParallelEnv
 from PIL import Image
 
 from credo.algorithms.neuroevolution import Neuroevolution
+from credo.environments.base import AbstractEnvironment
 from credo.environments.gymnasium import Gymnasium
+from credo.environments.pettingzoo import PettingZoo
 from credo.environments.sequence_recall import SequenceRecall
-from credo.environments.wrappers import DelayedHostReward
+from credo.environments.wrappers import DelayedHostReward, DelayedReward
 from credo.networks.mlp import MLP
 from credo.networks.recurrent import Recurrent
+from credo.networks.team import Team
 from credo.runs import checkpoint, config
 from credo.runs.loop import Run, RunError
-from credo.runs.watch import _write_mp4, watch
+from credo.runs.watch import _maker, _takes, _write_mp4, watch
+from credo.types import TimeStep
 
 LENGTH = 6
 
@@ -64,6 +71,39 @@ class Blind(Painter):
     metadata = {"render_modes": ["human"]}
 
 
+class Wrapped(gymnasium.Wrapper):
+    """Of one's own, and without render_mode."""
+
+    def __init__(self):
+        super().__init__(Painter())
+
+
+class Handed(gymnasium.Wrapper):
+    """It hands on what the task within takes."""
+
+    def __init__(self, **kwargs):
+        super().__init__(Painter(**kwargs))
+
+
+class Picky(gymnasium.Wrapper):
+    """Its arguments go nowhere that draws."""
+
+    def __init__(self, **kwargs):
+        super().__init__(Painter(**{"raises": "", **kwargs, "size": 3} if kwargs else {}))
+
+
+class Clear(Painter):
+    """Its pictures have an alpha channel."""
+
+    def render(self):
+        picture = super().render()
+        return np.concatenate([picture, np.full((*self.size, 1), 51, np.uint8)], axis=2)
+
+
+def factory(render_mode=None, width=8, height=8) -> gymnasium.Env:
+    return gymnasium.wrappers.TimeLimit(Painter(render_mode, width, height), 3)
+
+
 def task(name="Painter", **kwargs):
     return Gymnasium(f"test_watch:{name}", kwargs, max_episode_steps=LENGTH, in_process=True)
 
@@ -71,12 +111,12 @@ def task(name="Painter", **kwargs):
 def made(path, env, network=None) -> Run:
     """A run on disk whose champion has fresh weights."""
     path.mkdir()
-    network = network or MLP((3,))
+    network = network or (MLP((3,)) if env.agents is None else Team((3,)))
     algorithm = Neuroevolution(env, network, population_size=10)
-    policy = network.init(env.obs_size, env.action_size, key=jax.random.key(0))
+    policy = network.init(*env.sizes, key=jax.random.key(0))
     checkpoint.export_policy(path / "champion.safetensors", policy)
     config.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
-    return Run(path)
+    return Run(path, trust=True)
 
 
 def frames(path) -> tuple[np.ndarray, list[int]]:
@@ -96,7 +136,7 @@ def test_a_film_shows_what_the_champion_does(tmp_path):
     pictures, durations = frames(output)
     assert pictures.shape == (2 * (LENGTH + 1), 16, 20, 3)
     assert set(durations) == {50}  # 20 steps per second
-    policy, expected = run.policy(), []
+    policy, expected = run.policy(raw=True), []
     for seed in (30, 31):
         policy.reset()
         expected.append((0, seed, 0))
@@ -157,20 +197,151 @@ def test_without_a_name_the_film_lies_in_the_run(tmp_path):
 @pytest.mark.parametrize("output", [None, "film.gif"])
 def test_a_task_of_numbers_has_nothing_to_draw(tmp_path, output):
     run = made(tmp_path / "run", SequenceRecall(depth=2))
-    told = r"nothing to draw.*rovers, T-mazes and tasks of Gymnasium\. `credo report .*run` shows"
+    told = r"nothing to draw.*rovers, T-mazes, tasks of Gymnasium.*\. `credo report .*run` shows"
     with pytest.raises(RunError, match=told):
         watch(run, output and tmp_path / output)
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
+def test_a_wrapper_that_hands_render_mode_on_is_drawn(tmp_path):
+    run = made(tmp_path / "run", task("Handed"))
+    pictures, _ = frames(watch(run, tmp_path / "film.gif", size=(20, 16)))
+    assert pictures.shape == (LENGTH + 1, 16, 20, 3)
+
+
+def test_a_picture_with_an_alpha_channel_is_laid_on_white(tmp_path):
+    run = made(tmp_path / "run", task("Clear"))
+    pictures, _ = frames(watch(run, tmp_path / "film.gif"))
+    # A fifth of 40 t, four fifths of 255.
+    np.testing.assert_allclose(
+        pictures[:, 0, 0, 0], [204 + 8 * t for t in range(LENGTH + 1)], atol=1
+    )
+
+
+def test_what_makes_an_environment_is_asked_for_its_arguments():
+    env = gymnasium.wrappers.TimeLimit(Painter(), 3)
+    assert _maker("test_watch:factory", env) is factory
+    assert _maker("test_watch:Wrapped", env) is Wrapped
+    assert _maker("nobody:knows", env) is Painter
+    cases = [(factory, True), (Wrapped, False), (Handed, True), (Fixed, True), (Painter, True)]
+    for maker, takes in cases:
+        assert _takes(maker, Painter, "render_mode") == takes
+    assert not _takes(Fixed, Fixed, "width")
+
+
+class Crew(AbstractEnvironment):
+    """Two agents in JAX; a picture shows the step, and what each of them did last."""
+
+    obs_size: ClassVar[int] = 3
+    action_size: ClassVar[int] = 2
+    max_steps: ClassVar[int] = LENGTH
+    signals: ClassVar[tuple[str, ...]] = ("global",)
+    agents: ClassVar[int | None] = 2
+
+    def reset(self, *, key):
+        state = (jnp.int32(0), jnp.zeros(2))
+        return state, self._now(*state)
+
+    def step(self, state, action, *, key):
+        state = (state[0] + 1, action[:, 0])
+        return state, self._now(*state)
+
+    def _now(self, step, last):
+        obs = jnp.stack([jnp.full(2, step, jnp.float32), last, jnp.arange(2.0)], axis=1)
+        end = step >= self.max_steps
+        return TimeStep(obs, {"global": jnp.float32(0.0)}, jnp.bool_(False), end)
+
+    def render(self, state):
+        step, last = state
+        colour = (40 * int(step), *(round(100 + 100 * float(x)) for x in last))
+        return np.full((6, 8, 3), colour, np.uint8)
+
+
+class Players(ParallelEnv):
+    """The same as a team of PettingZoo, in which the second agent leaves after two steps."""
+
+    metadata = {"name": "players", "render_modes": ["rgb_array"], "render_fps": 20}
+    possible_agents = ["a", "b"]
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def observation_space(self, agent):
+        return gymnasium.spaces.Box(-9.0, 9.0, (2,), np.float32)
+
+    def action_space(self, agent):
+        return gymnasium.spaces.Box(0.0, 200.0, (1,), np.float32)
+
+    def reset(self, seed=None, options=None):
+        self.agents, self.t, self.last = ["a", "b"], 0, {"a": 0.0, "b": 0.0}
+        return self._said(self.agents), {}
+
+    def step(self, actions):
+        self.t, acted = self.t + 1, self.agents
+        self.last |= {agent: float(action[0]) for agent, action in actions.items()}
+        over = {agent: self.t >= LENGTH or (agent == "b" and self.t >= 2) for agent in acted}
+        self.agents = [agent for agent in acted if not over[agent]]
+        nothing = dict.fromkeys(acted, 0.0)
+        return self._said(acted), nothing, over, dict.fromkeys(acted, False), {}
+
+    def _said(self, agents):
+        return {agent: np.float32([self.t, k]) for k, agent in enumerate(agents)}
+
+    def render(self):
+        if self.render_mode != "rgb_array":
+            raise RuntimeError("not asked for")
+        colour = (40 * self.t, *(round(self.last[agent]) for agent in "ab"))
+        return np.full((6, 8, 3), colour, np.uint8)
+
+
+class Shy(Players):
+    """It cannot be asked to draw."""
+
+    def __init__(self):
+        super().__init__()
+
+
+def test_a_team_of_ones_own_in_jax_is_drawn(tmp_path):
+    run = made(tmp_path / "run", DelayedReward(Crew()), Team((4,), Recurrent("gru", 3)))
+    pictures, _ = frames(watch(run, tmp_path / "film.gif", episodes=2))
+    policy, expected = run.policy(), []
+    last = np.zeros(2)
+    for t in range(LENGTH + 1):
+        expected.append((40 * t, *(100 + 100 * last if t else (100, 100))))
+        last = policy(np.stack([t * np.ones(2), last, np.arange(2.0)], axis=1))[:, 0]
+    assert len(pictures) == 2 * (LENGTH + 1)
+    for episode in np.split(pictures[:, 3, 4], 2):
+        np.testing.assert_allclose(episode, expected, atol=1)
+
+
+def crew(name):
+    return PettingZoo(f"test_watch:{name}", max_episode_steps=LENGTH, in_process=True)
+
+
+def test_a_team_of_pettingzoo_is_drawn(tmp_path):
+    run = made(tmp_path / "run", crew("Players"), Team((4,), Recurrent("gru", 3)))
+    pictures, durations = frames(watch(run, tmp_path / "film.gif"))
+    assert set(durations) == {50}
+    policy, expected, last = run.policy(raw=True), [(0, 0, 0)], np.zeros(2)
+    for t in range(LENGTH):
+        there = t < 2
+        rows = np.float32([[t, 0.0], [t, 1.0] if t <= 2 else [0.0, 0.0]])
+        last[: 1 + there] = 100 + 100 * policy(rows)[: 1 + there, 0]
+        expected.append((40 * (t + 1), *last))
+    np.testing.assert_allclose(pictures[:, 3, 4], expected, atol=1)
+
+
 @pytest.mark.parametrize(
     ("env", "told"),
     [
+        (task("Wrapped"), r"its class Wrapped must take render_mode.*names \['rgb_array'\]"),
+        (task("Picky"), r"its class Picky must take render_mode"),
+        (crew("Shy"), r"its class Shy must take render_mode"),
         (task("Blind"), r"must take render_mode.*it names \['human'\]"),
         (task(raises="no screen"), r"RuntimeError: no screen\): install what it names, or mend"),
         (task(dtype="float32"), "dtype float32: its render"),
     ],
-    ids=["mode", "raises", "dtype"],
+    ids=["wrapper", "kwargs", "team", "mode", "raises", "dtype"],
 )
 def test_what_cannot_be_drawn_says_why_and_leaves_no_file(tmp_path, env, told):
     run = made(tmp_path / "run", env)
@@ -219,7 +390,8 @@ print(env.render().shape)
 
 def drawn_with(renderer, code, *arguments):
     """The output of Python code where MuJoCo draws through `renderer`."""
-    environment = os.environ | {"MUJOCO_GL": renderer, "PYTHONPATH": os.path.dirname(__file__)}
+    path = os.pathsep.join(filter(None, [os.path.dirname(__file__), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"MUJOCO_GL": renderer, "PYTHONPATH": path}
     command = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, env=environment)
 

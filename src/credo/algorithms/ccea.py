@@ -30,7 +30,6 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
 from ..compilation import jit
-from ..environments.base import AbstractEnvironment
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.extinction import Extinction
 from ..evolution.islands import Islands
@@ -39,7 +38,7 @@ from ..evolution.selection import AbstractSelection, Tournament, rankable
 from ..networks.base import AbstractNetwork
 from ..networks.mlp import MLP
 from ..networks.team import Team, TeamPolicy
-from ..rollout import evaluate
+from ..rollout import Environment, evaluate
 from ..types import Metrics
 from .neuroevolution import breed
 
@@ -54,7 +53,7 @@ class CCEA(eqx.Module):
 
     default_budget: ClassVar[dict[str, int]] = {"generations": 1_000}
 
-    env: AbstractEnvironment
+    env: Environment
     network: AbstractNetwork = MLP(hidden=(20,))  # of one agent
     population_size: int = eqx.field(static=True, default=100)  # k, of each population
     elite_fraction: float = eqx.field(static=True, default=0.04)
@@ -99,7 +98,7 @@ class CCEA(eqx.Module):
             raise TypeError(f"islands is {self.islands!r}: give Islands(number=4), or None")
 
     @classmethod
-    def ccea(cls, env: AbstractEnvironment, network: AbstractNetwork | None = None, **overrides):
+    def ccea(cls, env: Environment, network: AbstractNetwork | None = None, **overrides):
         """The settings of section 4.1.2."""
         given: dict[str, Any] = {} if network is None else {"network": network}
         return cls(env, **given | overrides)

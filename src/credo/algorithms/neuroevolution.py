@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
 from ..compilation import jit
-from ..environments.base import AbstractEnvironment, AbstractSequenceTask
+from ..environments.base import AbstractSequenceTask
 from ..environments.sequence_classification import SequenceClassification
 from ..evolution.agents import AgentCrossover
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover, NoCrossover, OnePointCrossover
@@ -36,7 +36,7 @@ from ..networks.base import AbstractNetwork
 from ..networks.dmmu import DMMU
 from ..networks.mmu import MMU
 from ..networks.team import Team
-from ..rollout import evaluate
+from ..rollout import Environment, evaluate
 from ..types import Evaluation, Metrics
 
 
@@ -67,7 +67,7 @@ class NeuroevolutionState(eqx.Module):
 class Neuroevolution(eqx.Module):
     """Evolve a population of `network` policies on `env`."""
 
-    env: AbstractEnvironment
+    env: Environment
     network: AbstractNetwork
     population_size: int = eqx.field(static=True, default=100)  # k
     elite_fraction: float = eqx.field(static=True, default=0.1)  # ψ
@@ -124,7 +124,7 @@ class Neuroevolution(eqx.Module):
                 )
 
     @classmethod
-    def as_coded(cls, env: AbstractEnvironment, network: AbstractNetwork, **overrides) -> Self:
+    def as_coded(cls, env: Environment, network: AbstractNetwork, **overrides) -> Self:
         """The author's program of 2017: one gate per genome, up to 20 % of each matrix hit with
         20 % noise, 5 % of the hits super, repeated survivors replaced by row crossover."""
         return cls(
@@ -132,7 +132,7 @@ class Neuroevolution(eqx.Module):
         )
 
     @classmethod
-    def ours(cls, env: AbstractEnvironment, network: AbstractNetwork, **overrides) -> Self:
+    def ours(cls, env: Environment, network: AbstractNetwork, **overrides) -> Self:
         """The best settings found, with their ablation in docs/neuroevolution.md: the author's
         operators with weights clipped to ±40 and a tenth of the hits erasing. On a sequence task
         also a curriculum, the share of right answers as fitness, and parsimony; on Sequence
@@ -153,7 +153,7 @@ class Neuroevolution(eqx.Module):
         return cls.as_coded(env, network, **settings | overrides)
 
     @classmethod
-    def dmmu(cls, env: AbstractEnvironment, network: AbstractNetwork, **overrides) -> Self:
+    def dmmu(cls, env: Environment, network: AbstractNetwork, **overrides) -> Self:
         """Algorithm 5 with the settings of section 4.2.1: for teams on the server fleet. Where
         agents share weights they do not change places."""
         mating: tuple[AbstractCrossover, ...] = (OnePointCrossover(),)

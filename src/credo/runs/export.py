@@ -6,36 +6,29 @@ import pathlib
 from typing import Any
 
 import equinox as eqx
-import gymnasium
 import numpy as np
 import safetensors.numpy
 
-from ..environments.gymnasium import Gymnasium
-from ..networks.mlp import MLPPolicy
-from ..networks.mmu import MMUPolicy
-from ..networks.recurrent import RecurrentPolicy
 from ..runner import DESCRIPTION, FINGERPRINT, VERSION, Runner, fingerprint
 from . import config, files
 from .loop import Run, RunError
-from .watch import gymnasium_task, opened
+from .policy import champion, task_of
+
+Weights = dict[str, np.ndarray]
 
 
 def export(run: Run, path: str | pathlib.Path) -> pathlib.Path:
     """Write a run's champion to one safetensors file, for `credo.runner.Runner.load`.
 
-    Its metadata describe the network, the sizes and, for a task of Gymnasium, the action space,
-    so that the runner acts in the environment's own units. What was at `path` is replaced.
+    Its metadata describe the network, the sizes and, for a task of Gymnasium or PettingZoo, the
+    action space, so that the runner acts in the environment's own units. The run's record tells
+    them: no environment is opened. What was at `path` is replaced.
 
-    **Raises:** `RunError` if the network is none of MLP, MMU and Recurrent.
+    **Raises:** `RunError` if the network is none of Credo's.
     """
-    path, policy = pathlib.Path(path), run.champion
-    if not isinstance(policy, MLPPolicy | MMUPolicy | RecurrentPolicy):
-        raise RunError(
-            f"{type(policy).__name__} cannot be exported: the runner knows MLP, MMU and Recurrent; "
-            "from Python, Run(path).policy() plays any network"
-        )
-    weights = _weights(policy)
-    description = json.dumps(_describe(run, policy))
+    path, policy = pathlib.Path(path), champion(run)
+    network, weights = parts_of(policy)
+    description = json.dumps(_describe(run, network))
     metadata = {DESCRIPTION: description, FINGERPRINT: fingerprint(description, weights)}
     with files.whole(path) as draft:
         draft.write_bytes(safetensors.numpy.save(weights, metadata))
@@ -43,33 +36,69 @@ def export(run: Run, path: str | pathlib.Path) -> pathlib.Path:
     return path
 
 
-def _weights(policy: MLPPolicy | MMUPolicy | RecurrentPolicy) -> dict[str, np.ndarray]:
-    named = vars(policy) if isinstance(policy, MMUPolicy) else policy.weights
-    return {name: np.array(w, np.float32) for name, w in named.items() if eqx.is_array(w)}
+def parts_of(policy: Any) -> tuple[dict[str, Any], Weights]:
+    """The network of a policy as JSON: its type, its config and the networks it is made of; and
+    all its weights by name."""
+    name = type(policy).__name__
+    if not type(policy).__module__.startswith("credo.networks.") or name not in KINDS:
+        raise RunError(
+            f"{name} cannot be exported: the runner knows MLP, MMU and Recurrent, teams of them, "
+            "DMMU and Centralized; from Python, Run(path).policy() plays any network"
+        )
+    kind, own, inner = KINDS[name]
+    settings = config.to_tree(getattr(policy, "config", {}))
+    fields = {k: v for k, v in settings.items() if k not in ("class", "head")}
+    weights = {k: np.array(w, np.float32) for k, w in own(policy).items() if eqx.is_array(w)}
+    parts = []
+    for prefix, part in inner(policy).items():
+        node, within = parts_of(part)
+        parts.append(node)
+        weights |= {f"{prefix}.{k}": w for k, w in within.items()}
+    return {"type": kind, "config": fields, "parts": parts}, weights
 
 
-def _describe(run: Run, policy: MLPPolicy | MMUPolicy | RecurrentPolicy) -> dict[str, Any]:
-    env = run.algorithm.env
-    task = gymnasium_task(env)
-    fields = config.to_tree(policy.config)
+def _trunks(policy: Any) -> Weights:
+    """Those of a team."""
     return {
-        "version": VERSION,
-        "credo": importlib.metadata.version("credo"),
-        "task": type(env).__name__ if task is None else task.id,
-        "network": type(policy.config).__name__,
-        "config": {name: value for name, value in fields.items() if name != "class"},
-        "obs_size": env.obs_size,
-        "action_size": env.action_size,
-        "action": None if task is None else _action(task),
+        f"trunks.{i}.{name}": w
+        for i, trunk in enumerate(policy.trunks)
+        for name, w in trunk.items()
     }
 
 
-def _action(task: Gymnasium) -> dict[str, Any]:
-    """The action space as JSON."""
-    with opened(task) as copy:
-        space = copy._envs[0].action_space
-    if isinstance(space, gymnasium.spaces.Discrete):
-        return {"n": int(space.n), "start": int(space.start)}
-    assert isinstance(space, gymnasium.spaces.Box)  # or it could not have been opened
-    low, high = (np.float64(bound).ravel().tolist() for bound in (space.low, space.high))
-    return {"low": low, "high": high, "shape": list(space.shape), "dtype": str(space.dtype)}
+def _numbered(name: str):
+    return lambda policy: {f"{name}.{i}": x for i, x in enumerate(getattr(policy, name))}
+
+
+def _within(policy: Any) -> dict[str, Any]:
+    return {"policy": policy.policy}
+
+
+KINDS: dict[str, tuple[str, Any, Any]] = {
+    "MLPPolicy": ("MLP", lambda policy: policy.weights, lambda _: {}),
+    "MMUPolicy": ("MMU", vars, lambda _: {}),
+    "RecurrentPolicy": ("Recurrent", lambda policy: policy.weights, lambda _: {}),
+    "TeamPolicy": ("Team", _trunks, _numbered("heads")),
+    "DMMUPolicy": ("DMMU", lambda _: {}, _numbered("agents")),
+    "CentralizedPolicy": ("Centralized", lambda _: {}, _within),
+    "Normalized": ("Normalized", lambda p: {"mean": p.mean, "std": p.std}, _within),
+}
+"""Of each policy its network's name for the runner, its own weights, and the policies within."""
+
+
+def _describe(run: Run, network: dict[str, Any]) -> dict[str, Any]:
+    env, task = run.config["algorithm"]["env"], task_of(run)
+    while "id" not in env and "env" in env:  # what pays rewards later, say
+        env = env["env"]
+    return {
+        "version": VERSION,
+        "credo": importlib.metadata.version("credo"),
+        "task": env.get("id") or env["class"].partition(":")[2],
+        "network": network,
+        "obs_size": task["obs_size"],
+        "action_size": task["action_size"],
+        "agents": task["agents"],
+        "action": task["actions"],
+        "observations": task.get("observations"),
+        "names": task.get("names"),
+    }

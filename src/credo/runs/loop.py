@@ -30,11 +30,12 @@ from ..compilation import jit
 from ..environments import processes
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..replay import Replay, shapes_alone
-from . import checkpoint, config, files, log, record, screen, weights
+from . import checkpoint, config, files, log, policy, record, screen, weights
 from .budget import Budget, fitted
 from .folder import free_name, new_folder
 from .folder import runs_in as runs_in
 from .lock import lock
+from .policy import Policy
 from .progress import Progress
 from .record import RunError
 from .signals import Signals
@@ -98,31 +99,13 @@ class Run:
             like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0)).champion
         return _champion(self, like)
 
-    def policy(self) -> "Policy":
-        """The champion as a plain callable on NumPy observations."""
-        return Policy(self.champion)
+    def restored(self, like: PyTree) -> PyTree:
+        """The champion, of which `like` has the structure. Raises as `champion` does."""
+        return _champion(self, like)
 
-
-class Policy:
-    """A trained policy: `action = policy(observation)`, its memory kept between calls."""
-
-    def __init__(self, policy: PyTree):
-        arrays, self._static = eqx.partition(policy, eqx.is_array)
-        self._arrays = arrays
-        self._step = jax.jit(
-            lambda arrays, obs, carry: eqx.combine(arrays, self._static)(obs, carry)
-        )
-        self.reset()
-
-    def reset(self, seed: int = 0) -> None:
-        """Forget: call at the start of every episode."""
-        self._carry = eqx.combine(self._arrays, self._static).start(key=jax.random.key(seed))
-
-    def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """An action in [-1, 1], float32."""
-        obs = jnp.asarray(observation, jnp.float32)
-        action, self._carry = self._step(self._arrays, obs, self._carry)
-        return np.asarray(action)
+    def policy(self, raw: bool = False) -> Policy:
+        """The champion as a plain callable, in the task's own units; `raw`: in [-1, 1]."""
+        return policy.of(self, raw)
 
 
 @screen.calm()

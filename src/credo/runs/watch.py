@@ -1,6 +1,7 @@
-"""What `credo watch` makes: a film of a champion, a page that plays in the browser, or pictures."""
+"""What `credo watch` makes of a run's best policy: a video, or an HTML page."""
 
 import contextlib
+import functools
 import importlib.util
 import inspect
 import itertools
@@ -10,21 +11,21 @@ import pathlib
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-import gymnasium
+import jax
 import numpy as np
 
 from .. import require
 from ..environments import worker
 from ..environments.extended_tmaze import ExtendedTMaze
-from ..environments.gymnasium import Gymnasium
+from ..environments.foreign import AbstractForeignEnvironment
 from ..environments.host import AbstractHostEnvironment
 from ..environments.rover import Rover
-from ..environments.wrappers import DelayedHostReward, DelayedReward
 from . import files, maze_page, replay_page
-from .loop import Policy, Run, RunError
+from .loop import Run, RunError
+from .policy import Policy, champion, undelayed
 
 FASTEST = 50  # pictures per second: browsers slow a gif down that has more
 STEPS = 30  # per second, where an environment does not say
@@ -40,10 +41,11 @@ def watch(
     fps: float | None = None,
     size: tuple[int, int] = (480, 480),
 ) -> pathlib.Path:
-    """Show episodes of a run's champion, without a window: on a Gymnasium task or with rovers as a
-    film, with rovers also as a page that plays in the browser, in a T-maze as a page of pictures.
+    """Show episodes of a run's best policy, without a window: a video of a task of Gymnasium or
+    PettingZoo that draws "rgb_array", of rovers, or of a JAX task with `render(state)`; of rovers
+    also a page that plays in the browser, of a T-maze a page of pictures.
 
-    A Gymnasium environment is made in this process.
+    An environment of others is made in this process.
 
     **Arguments:**
 
@@ -52,9 +54,9 @@ def watch(
       folder with rovers and of a T-maze, else `champion.gif`.
     - `episodes`: one after the other, with seeds `seed`, `seed` + 1, …
     - `fps`: environment steps shown per second; None: in real time, as far as the environment
-      tells, and 5 with rovers. Above 50 a film leaves some steps out. The speed of a page can be
+      tells, and 5 with rovers. Above 50 a video leaves some steps out. The speed of a page can be
       changed in the page. Of a T-maze nothing moves.
-    - `size`: width and height of a film in pixels, where the environment lets us choose (MuJoCo's
+    - `size`: width and height of a video in pixels, where the environment lets us choose (MuJoCo's
       and rovers do).
 
     **Returns:** `output`. What was there is replaced once the new file is whole.
@@ -66,24 +68,28 @@ def watch(
     require.at_least("height", size[1], 2)
     if fps is not None and not 0 < fps < math.inf:
         raise ValueError(f"fps is {fps}: it must be more than 0")
-    env = run.algorithm.env
-    rovers, maze, task = rover_task(env), maze_task(env), gymnasium_task(env)
-    paged = rovers is not None or maze is not None
+    task = undelayed(run.algorithm.env)
+    paged = isinstance(task, Rover | ExtendedTMaze)
     default = run.path / ("champion.html" if paged else "champion.gif")
     output = default if output is None else pathlib.Path(output)
     seeds = range(seed, seed + episodes)
-    if maze is not None:
-        return _show_maze(run, maze, output, seeds)
-    if rovers is not None:
-        return _watch_rovers(run, rovers, output, seeds, fps or ROVER_STEPS, size)
+    if isinstance(task, ExtendedTMaze):
+        return _show_maze(run, task, output, seeds)
+    if isinstance(task, Rover):
+        return _watch_rovers(run, task, output, seeds, fps or ROVER_STEPS, size)
     write = _writer(output)
-    if task is None:
+    if isinstance(task, AbstractForeignEnvironment):
+        with _drawing(task, size) as copy:
+            rate = fps or _clock(copy._envs[0]) or STEPS
+            stride = math.ceil(rate / FASTEST)
+            pictures = _pictures(copy, task.id, Policy(champion(run)), seeds, stride)
+            return _film(write, output, pictures, rate / stride)
+    if not hasattr(task, "render") or isinstance(task, AbstractHostEnvironment):
         raise RunError(_nothing_to_see(run))
-    with opened(task, **_drawing(task, size)) as copy:
-        rate = fps or copy._envs[0].metadata.get("render_fps") or STEPS
-        stride = math.ceil(rate / FASTEST)
-        pictures = _pictures(copy, task.id, run.policy(), seeds, stride)
-        return _film(write, output, pictures, rate / stride)
+    rate = fps or STEPS
+    stride = math.ceil(rate / FASTEST)
+    pictures = _scenes(task, Policy(champion(run)), seeds, stride)
+    return _film(write, output, pictures, rate / stride)
 
 
 def _watch_rovers(
@@ -125,36 +131,13 @@ def _film(
     return output
 
 
-def rover_task(env: Any) -> Rover | None:
-    """The rover domain itself, without what pays its rewards later; None if it is another task."""
-    while isinstance(env, DelayedReward):
-        env = env.env
-    return env if isinstance(env, Rover) else None
-
-
-def maze_task(env: Any) -> ExtendedTMaze | None:
-    """The T-maze itself, without what pays its rewards later; None if it is another task."""
-    while isinstance(env, DelayedReward):
-        env = env.env
-    return env if isinstance(env, ExtendedTMaze) else None
-
-
-def gymnasium_task(env: Any) -> Gymnasium | None:
-    """The task of Gymnasium itself, without what pays its rewards later; None if it is another."""
-    while isinstance(env, DelayedHostReward):
-        env = env.env
-    return env if isinstance(env, Gymnasium) else None
-
-
 @contextlib.contextmanager
-def opened(task: Gymnasium, **kwargs: Any) -> Iterator[worker.Environments]:
+def opened(task: AbstractForeignEnvironment, **kwargs: Any) -> Iterator[worker.Environments]:
     """One copy of a task in this process, with further arguments, behind the flat arrays that its
     worker has."""
-    limit = task.max_episode_steps
-    spec = {"id": task.id, "kwargs": dict(task.kwargs) | kwargs, "max_episode_steps": limit}
-    copy = None
+    spec, copy = task.spec(), None
     try:
-        copy = worker.Environments(spec, 1)
+        copy = worker.Environments(spec | {"kwargs": spec["kwargs"] | kwargs}, 1)
         yield copy
     except worker.Fault as fault:
         chosen = os.environ.get("MUJOCO_GL", "")  # its library is loaded with MuJoCo
@@ -168,7 +151,10 @@ def opened(task: Gymnasium, **kwargs: Any) -> Iterator[worker.Environments]:
 def _nothing_to_see(run: Run) -> str:
     env = run.algorithm.env
     name = type(env).__name__
-    seen = "what can be watched are rovers, T-mazes and tasks of Gymnasium"
+    seen = (
+        "what can be watched are rovers, T-mazes, tasks of Gymnasium and PettingZoo, and JAX tasks "
+        "with render(state), which returns a picture [height, width, 3]"
+    )
     if isinstance(env, AbstractHostEnvironment):
         return f"{name} cannot be drawn: {seen}"
     return (
@@ -177,31 +163,87 @@ def _nothing_to_see(run: Run) -> str:
     )
 
 
-def _drawing(task: Gymnasium, size: tuple[int, int]) -> dict[str, Any]:
-    """Arguments with which the task can be drawn."""
+@contextlib.contextmanager
+def _drawing(
+    task: AbstractForeignEnvironment, size: tuple[int, int]
+) -> Iterator[worker.Environments]:
+    """One copy of a task that draws, at this size if it lets us choose."""
     with opened(task) as copy:
-        env = copy._envs[0].unwrapped
-    modes = env.metadata.get("render_modes", [])
-    if not _takes(type(env), "render_mode") or "rgb_array" not in modes:
-        raise RunError(
-            f"{task.id} cannot be drawn: for that its class {type(env).__name__} must take "
-            "render_mode, name 'rgb_array' among the render_modes of its metadata, and return "
-            f"an array [height, width, 3] from render(); it names {list(modes)}"
-        )
-    sized = _takes(type(env), "width") and _takes(type(env), "height")
-    return {"render_mode": "rgb_array"} | ({"width": size[0], "height": size[1]} if sized else {})
+        env: Any = copy._envs[0]
+        maker, inner = _maker(task.id, env), type(env.unwrapped)
+        modes = list(getattr(env, "metadata", {}).get("render_modes", []))
+    mode = {"render_mode": "rgb_array"}
+    sized = mode | {"width": size[0], "height": size[1]}
+    told = (
+        f"{task.id} cannot be drawn: for that {_called(maker)} must take render_mode, name "
+        "'rgb_array' among the render_modes of its metadata, and return an array "
+        f"[height, width, 3] from render(); it names {modes}"
+    )
+    if "rgb_array" not in modes or not _takes(maker, inner, "render_mode"):
+        raise RunError(told)
+    choice = all(_takes(maker, inner, side) for side in ("width", "height"))
+    with contextlib.ExitStack() as stack:
+        for arguments in (sized, mode) if choice else (mode,):
+            try:
+                copy = stack.enter_context(opened(task, **arguments))
+                break
+            except RunError as error:  # **kwargs may lead to what does not take them
+                if not isinstance(_first(error), TypeError):
+                    raise
+        else:
+            raise RunError(told)
+        yield copy
 
 
-def _takes(cls: type, name: str) -> bool:
-    """Whether a class can be made with an argument of this name, its own or handed on."""
-    for base in cls.__mro__:
-        if "__init__" in vars(base):
-            parameters = inspect.signature(vars(base)["__init__"]).parameters
-            if name in parameters:
-                return True
-            if all(p.kind != inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
-                return False
-    return False
+def _first(error: BaseException) -> BaseException:
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return error
+
+
+def _maker(id: str, env: Any) -> Any:
+    """The class or function that made an environment; its modules are imported by now."""
+    module, _, path = id.partition(":")
+    registered = getattr(getattr(env, "spec", None), "entry_point", None)
+    for name in (id, registered if isinstance(registered, str) else "", f"{module}:parallel_env"):
+        module, _, path = name.partition(":")
+        found = sys.modules.get(module)
+        for part in path.split("."):
+            found = getattr(found, part, None)
+        if callable(found):
+            return found
+    return registered if callable(registered) else type(env.unwrapped)
+
+
+def _called(maker: Any) -> str:
+    kind = "its class" if inspect.isclass(maker) else "its function"
+    return f"{kind} {getattr(maker, '__name__', maker)}"
+
+
+def _takes(maker: Any, inner: type, name: str) -> bool:
+    """Whether what makes an environment takes an argument of this name: its own, or through
+    **kwargs a base class's or that of `inner`, the environment within all wrappers."""
+    own = _parameters(maker)
+    if name in own:
+        return True
+    if all(p.kind != inspect.Parameter.VAR_KEYWORD for p in own.values()):
+        return False
+    bases = [vars(base).get("__init__") for base in getattr(maker, "__mro__", ())]
+    if any(name in _parameters(base) for base in bases if inspect.isfunction(base)):
+        return True
+    return maker is not inner and _takes(inner, inner, name)
+
+
+def _parameters(maker: Any) -> Mapping[str, inspect.Parameter]:
+    try:
+        return inspect.signature(maker.__init__ if inspect.isclass(maker) else maker).parameters
+    except (TypeError, ValueError):  # it is not Python's
+        return {}
+
+
+def _clock(env: Any) -> float | None:
+    """Steps per second, if the environment says."""
+    return getattr(env, "metadata", {}).get("render_fps")
 
 
 def _pictures(
@@ -209,38 +251,71 @@ def _pictures(
 ) -> Iterator[np.ndarray]:
     """`[height, width, 3]`, uint8: the start and the end of every episode, and every `stride`-th
     step between."""
-    env, active = copy._envs[0], np.ones(1, np.bool_)
+    env: Any = copy._envs[0]
+    active = np.ones(1, np.bool_)
     for seed in seeds:
         policy.reset()
-        frame = copy.reset(np.array([seed % 2**32], np.uint32), active)
-        yield _draw(env, name)
+        frame = _sound(copy.reset(np.array([seed % 2**32], np.uint32), active))
+        yield _draw(env.render, name, env)
         step, ended = 0, False
         while not ended:
-            frame = copy.step(policy(frame.obs[0])[None], active)
+            frame = _sound(copy.step(policy(frame.obs[0])[None], active))
             step += 1
             ended = bool(frame.terminated[0] or frame.truncated[0])
             if ended or step % stride == 0:
-                yield _draw(env, name)
+                yield _draw(env.render, name, env)
 
 
-def _draw(env: gymnasium.Env, name: str) -> np.ndarray:
+def _sound(frame: worker.Frame) -> worker.Frame:
+    for fault in frame.faults.values():
+        raise fault
+    return frame
+
+
+def _scenes(task: Any, policy: Policy, seeds: range, stride: int) -> Iterator[np.ndarray]:
+    """The same of a JAX task that draws its state."""
+    name = type(task).__name__
+    reset = jax.jit(lambda key: task.reset(key=key))
+    step = jax.jit(lambda state, action, key: task.step(state, action, key=key))
+    for seed in seeds:
+        policy.reset()
+        first_key, key = jax.random.split(jax.random.key(seed % 2**32))
+        state, now = reset(first_key)
+        yield _draw(functools.partial(task.render, state), name)
+        for i in itertools.count(1):
+            action = np.clip(policy(now.obs), -1.0, 1.0)
+            state, now = step(state, action, jax.random.fold_in(key, i))
+            ended = bool(now.terminated | now.truncated)
+            if ended or i % stride == 0:
+                yield _draw(functools.partial(task.render, state), name)
+            if ended:
+                break
+
+
+def _draw(render: Callable[[], Any], name: str, env: Any = None) -> np.ndarray:
     try:
-        picture: Any = env.render()
+        picture: Any = render()
     except Exception as error:  # an environment's own code, and a graphics library's
         told = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
         raise RunError(f"{name} cannot be drawn here ({told}): {_advice(env)}") from error
     picture = np.asarray(picture)
-    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):
         raise RunError(
             f"{name} drew an array of shape {picture.shape} and dtype {picture.dtype}: its "
             "render() must return [height, width, 3], uint8"
         )
-    return picture
+    return picture if picture.shape[2] == 3 else _on_white(picture)
 
 
-def _advice(env: gymnasium.Env) -> str:
+def _on_white(picture: np.ndarray) -> np.ndarray:
+    """A picture with an alpha channel, opaque."""
+    alpha = picture[:, :, 3:] / 255.0
+    return np.rint(alpha * picture[:, :, :3] + 255.0 * (1.0 - alpha)).astype(np.uint8)
+
+
+def _advice(env: Any) -> str:
     mujoco = sys.modules.get("gymnasium.envs.mujoco.mujoco_env")
-    if mujoco is not None and isinstance(env.unwrapped, mujoco.MujocoEnv):
+    if mujoco and isinstance(getattr(env, "unwrapped", None), mujoco.MujocoEnv):
         return (
             "without a display set the environment variable MUJOCO_GL=egl (it needs libEGL, from "
             "the graphics driver or Mesa) or MUJOCO_GL=osmesa (it needs libOSMesa) beforehand"
