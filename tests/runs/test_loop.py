@@ -18,12 +18,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from credo import rollout
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.sequence_classification import SequenceClassification
 from credo.networks.mmu import MMU
-from credo.runs import loop
+from credo.runs import checkpoint, config, loop
 from credo.runs.checkpoint import CheckpointError, DamagedCheckpoint, damage, read_metadata
 from credo.runs.lock import RunLocked
 
@@ -61,6 +62,14 @@ def contents(path) -> dict[str, bytes]:
     newest = checkpoints(path)[-1]
     files = [path / "metrics.csv", path / "champion.safetensors", *newest.iterdir()]
     return {str(file.relative_to(path)): file.read_bytes() for file in files}
+
+
+def results(path) -> dict[str, bytes]:
+    """The same without the seals, which tell budgets and versions apart."""
+    champion = safetensors.numpy.load_file(path / "champion.safetensors")
+    files = [path / "metrics.csv", checkpoints(path)[-1] / "state.safetensors"]
+    named = {str(file.relative_to(path)): file.read_bytes() for file in files}
+    return named | {name: array.tobytes() for name, array in champion.items()}
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +141,10 @@ def test_a_larger_budget_is_the_run_that_had_it_from_the_start(straight, tmp_pat
     train(tmp_path / "short", generations=7)
     resume(tmp_path / "short", generations=BUDGET)
     assert contents(tmp_path / "short") == contents(straight)
-    assert loop.Run(tmp_path / "short").config == loop.Run(straight).config
+    short, whole = loop.Run(tmp_path / "short").config, loop.Run(straight).config
+    assert (short["budget"], short["algorithm"]) == (whole["budget"], whole["algorithm"])
+    old = {"generations": 7, "frames": None, "stop_at": None}
+    assert short["changes"] == [{"generation": 7, "budget": old}]
 
 
 def test_a_smaller_budget_is_refused(straight):
@@ -173,14 +185,15 @@ def test_a_budget_of_generations_has_no_limit_of_frames():
     assert [row["generation"] for row in more] == [3]
 
 
-def test_a_run_of_an_older_version_knows_no_frames_and_no_optax(stopped, straight):
-    config = json.loads((stopped / "config.json").read_text())
-    del config["budget"]["frames"], config["machine"]["versions"]["optax"]
-    (stopped / "config.json").write_text(json.dumps(config))
+def test_a_run_of_an_older_version_knows_no_frames_optax_task_or_signature(stopped, straight):
+    old = json.loads((stopped / "config.json").read_text())
+    old = {name: old[name] for name in ("algorithm", "seed", "budget", "machine")}
+    del old["budget"]["frames"], old["machine"]["versions"]["optax"]
+    (stopped / "config.json").write_text(json.dumps(old))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         resume(stopped)
-    assert contents(stopped) == contents(straight)
+    assert results(stopped) == results(straight)
 
 
 def test_without_a_budget_neuroevolution_has_a_thousand_generations(tmp_path):
@@ -363,16 +376,18 @@ def test_a_disk_too_full_for_metrics_says_so_and_the_run_goes_on_later(straight,
     assert contents(tmp_path / "run") == contents(straight)
 
 
-def test_another_machine_is_mentioned(stopped):
-    config = json.loads((stopped / "config.json").read_text())
-    config["machine"]["cores"] += 1
-    (stopped / "config.json").write_text(json.dumps(config))
+def test_another_machine_is_mentioned(stopped, monkeypatch):
+    here = config.machine()
+    monkeypatch.setattr(config, "machine", lambda: here | {"cores": here["cores"] + 1})
     with pytest.warns(UserWarning, match=r"began elsewhere \(cores: .* not bit for bit"):
         run = resume(stopped)
     assert run.metrics["generation"][-1] == run.config["budget"]["generations"]  # it goes on
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+NUMBERS = [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+
+
+@pytest.mark.parametrize(("number", "code"), NUMBERS)
 def test_a_signal_saves_and_says_how_to_go_on(tmp_path, number, code):
     path = tmp_path / "run"
     arguments = "train neuroevolution sequence-classification --depth 2 --min-gap 1 --max-gap 2"
@@ -407,7 +422,7 @@ def test_a_signal_saves_and_says_how_to_go_on(tmp_path, number, code):
     assert end >= int(told[1]) + 5
     alone = tmp_path / "alone"
     train(alone, generations=end)
-    assert contents(path) == contents(alone)
+    assert results(path) == results(alone)
 
 
 def test_a_policy_plays_numpy_observations_like_a_rollout(straight):
@@ -473,12 +488,40 @@ def test_a_run_moves_with_its_folder(straight, tmp_path):
     assert contents(tmp_path / "moved") == contents(straight)
 
 
-def test_what_a_killed_start_left_behind_is_not_taken_over(straight, tmp_path):
+def test_what_a_killed_start_left_behind_is_replaced(tmp_path):
     run = tmp_path / "run"
-    run.mkdir()
-    shutil.copytree(straight / "checkpoints", run / "checkpoints")
+    checkpoint.save(run / "checkpoints", 0, jnp.ones(3), {"frames": 0})
+    (run / "checkpoints" / ".00000000.partial-1").mkdir()
+    (run / "lock").write_text("")
+    (run / ".config.json.draft.json").write_text("{")
     fresh = train(run, generations=2)
     assert fresh.metrics["generation"].tolist() == [1, 2]
+
+
+def tree(path) -> dict[str, bytes | None]:
+    """Every file and folder in a folder, with what is in it."""
+    return {
+        str(p.relative_to(path)): p.read_bytes() if p.is_file() else None for p in path.rglob("*")
+    }
+
+
+@pytest.mark.parametrize(
+    "name", ["checkpoints/model.pt", "metrics.csv", "checkpoints/00000007/COMMIT", "notes.txt"]
+)
+@pytest.mark.parametrize("source", [None, "nowhere"])
+def test_a_folder_of_somebody_else_stays_as_it_is(tmp_path, name, source):
+    (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
+    (tmp_path / name).write_text("mine")
+    before = tree(tmp_path)
+    with pytest.raises(loop.RunError, match=r"is not empty and no run|nowhere is not a run"):
+        train(tmp_path, generations=1, warm_start=source)
+    assert tree(tmp_path) == before
+
+
+def test_a_start_that_fails_leaves_an_empty_folder_empty(straight, tmp_path):
+    with pytest.raises(loop.RunError, match="cannot start from another run's"):
+        train(tmp_path, generations=1, warm_start=straight)
+    assert tree(tmp_path) == {}
 
 
 def test_a_run_with_a_mutation_of_a_script_can_be_reopened(tmp_path):
