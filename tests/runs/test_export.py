@@ -71,7 +71,7 @@ def made(path, env, network, seed=0) -> Run:
     policy = network.init(env.obs_size, env.action_size, key=jax.random.key(seed))
     checkpoint.export_policy(path / "champion.safetensors", policy)
     config.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": seed})
-    return Run(path)
+    return Run(path, trust=True)
 
 
 def observations(n=STEPS, size=3):

@@ -76,7 +76,7 @@ def made(path, env, network=None) -> Run:
     policy = network.init(env.obs_size, env.action_size, key=jax.random.key(0))
     checkpoint.export_policy(path / "champion.safetensors", policy)
     config.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
-    return Run(path)
+    return Run(path, trust=True)
 
 
 def frames(path) -> tuple[np.ndarray, list[int]]:
