@@ -171,7 +171,7 @@ def train(
         state = _initial(fit, jax.random.key(seed))
         if source is not None:
             state = _warm(algorithm, state, source)
-        said["task"] = record.task_of(algorithm.env)
+        said["task"] = config.to_tree(record.task_of(algorithm.env))
         files.remove(path / "checkpoints")  # left by a process that died here
         # The first checkpoint comes before the config: what has a config can be resumed.
         arrays, seals = eqx.filter(state, eqx.is_array), {"record": seal(said)}
@@ -227,8 +227,8 @@ def resume(
     """
     processes.allow()
     compilation.enable_cache()
-    run = Run(path, trust=trust)
-    with lock(run.path):
+    with lock(Run(path, trust=trust).path):  # what is no run gets no lock
+        run = Run(path, trust=trust)
         algorithm = run.algorithm
         old = Budget.read(run.config["budget"])
         budget = old if stop_at is None else dataclasses.replace(old, stop_at=stop_at)

@@ -25,7 +25,9 @@ def broken(state: PyTree) -> str | None:
     if sound.all():
         return None
     names = [path for path, _ in tree_flatten_with_path(kept)[0]]
-    return ", ".join(dict.fromkeys(_words(names[i]) for i in np.flatnonzero(~sound)))
+    told = list(dict.fromkeys(_words(names[i]) for i in np.flatnonzero(~sound)))
+    more = f" and {len(told) - 3} more" if len(told) > 3 else ""
+    return ", ".join(told[:3]) + more
 
 
 @jit
@@ -38,6 +40,8 @@ def _words(path: tuple[Any, ...]) -> str:
     part, *rest = [keystr((key,)).strip("[].'") for key in path]
     if part == "learners":
         part, rest = f"learner {rest[0]}", rest[1:]
-    elif part != "learner":
+    elif part == "learner":
+        part = "the learner"
+    else:
         return f"the {part}"
-    return f"the {rest[0]} of {part}" if rest else part
+    return f"the {rest[0].replace('_', ' ')} of {part}" if rest else part
