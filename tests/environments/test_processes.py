@@ -65,11 +65,11 @@ def one(copies, steps=2):
 def test_what_an_environment_starts_ends_with_it(detached, fault, tmp_path):
     mark = f"credo-test-{tmp_path}"
     copies = parent_task(mark, detached=detached, fault=fault).copies(1)
-    assert len(marked(mark)) == 1
+    assert until(lambda: len(marked(mark)) == 1)  # its arguments show a moment after its start
     before = marked(mark)
     if fault:
         assert one(copies).failed[0]
-        assert len(marked(mark)) == 1  # that of the new copy
+        assert until(lambda: len(marked(mark)) == 1)  # that of the new copy
         assert marked(mark) != before
     copies.close()
     assert marked(mark) == []
@@ -120,7 +120,7 @@ def test_a_worker_and_what_it_started_end_with_a_parent_that_is_killed(fault, de
         worker = children(guardian)
         time.sleep(0.3)
         assert len(worker) == 1
-        assert len(marked(mark)) == 2  # the parent is one of them
+        assert until(lambda: len(marked(mark)) == 2)  # the parent is one of them
         parent.kill()
         assert parent.wait() == -signal.SIGKILL
         assert until(lambda: marked(mark) == [])

@@ -242,7 +242,9 @@ class ForeignCopies(AbstractCopies):
         ends = (frame.terminated, frame.truncated)
         return HostStep(frame.obs, frame.rewards, *ends, acting, failed, frame.gone)
 
-    def _call(self, name: str, numbers: np.ndarray, active: np.ndarray):
+    def _call(
+        self, name: str, numbers: np.ndarray, active: np.ndarray
+    ) -> tuple[worker.Frame, np.ndarray]:
         """What the worker says, and which copies failed."""
         if self._closed:
             raise EnvironmentFailure(
@@ -251,18 +253,18 @@ class ForeignCopies(AbstractCopies):
         failed = active & self._stranded
         while True:
             backend = self._opened()
-            asked = active & ~failed
+            asked, frame, faults = active & ~failed, None, {}
             try:
                 frame = getattr(backend, name)(numbers, asked)
                 faults = frame.faults
             except worker.Lost as fault:
-                frame, faults = None, {int(backend.current[0]): fault}
+                faults[int(backend.current[0])] = fault
             except worker.Fault as fault:
                 self.close(grace=0.0)
                 copy = backend.current[0]
                 raise EnvironmentFailure(self._told(name, copy, fault)) from fault
             if faults:
-                self._failed(name, asked, faults)
+                self._failed(name, faults)
             if frame is not None:
                 break
             failed |= self._lost(name, asked, backend)
@@ -286,7 +288,7 @@ class ForeignCopies(AbstractCopies):
             self._whys[i] = self._whys[int(backend.current[0])]
         return gone
 
-    def _failed(self, name: str, asked: np.ndarray, faults: dict[int, worker.Fault]) -> None:
+    def _failed(self, name: str, faults: dict[int, worker.Fault]) -> None:
         """Count, and say when it is too much."""
         for copy, fault in faults.items():
             self._whys[copy] = self._told(name, copy, fault)

@@ -100,8 +100,9 @@ class Gymnasium(AbstractForeignEnvironment):
     one-hot, a Dict or Tuple is its parts one after the other. Actions: a Box is scaled so that -1
     is its low and 1 its high; of a Discrete the largest entry is taken, or the largest that
     `action_mask` allows, where a Dict observation or `info` has one. Without any time limit an
-    episode is truncated after 1,000 steps. `kwargs` may be given as a dict. Whatever goes wrong
-    raises `EnvironmentFailure`, and the next `copies` start a new worker.
+    episode is truncated after 1,000 steps. `kwargs` may be given as a dict. An episode in
+    which something goes wrong has a return of NaN and is discarded; if more than the share
+    `tolerated` are such, `EnvironmentFailure` is raised, and the next `copies` start a new worker.
     """
 
     id: str = eqx.field(static=True, converter=names.name_of)

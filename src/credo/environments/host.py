@@ -103,7 +103,8 @@ class InTurn(AbstractCopies):
             )
         some = self._some(np.asarray(seeds, np.uint32))
         obs = self.inner.reset(some, np.arange(self.inner.n) < lanes.size)
-        self.failed = None if self.inner.failed is None else self._all(self.inner.failed)
+        failed = self.inner.failed
+        self.failed = None if failed is None else self._all(failed)
         self._keep(self.failed)
         return self._all(obs)
 
@@ -111,11 +112,9 @@ class InTurn(AbstractCopies):
         if not np.isin(np.flatnonzero(active), self._seats).all():
             raise ValueError("a step was asked of a copy that is not playing: reset it first")
         now = self.inner.step(self._some(actions), self._some(active))
-        said = {name: getattr(now, name) for name in _PARTS}
-        said = {name: x if x is None else self._all(x) for name, x in said.items()}
-        rewards = {name: self._all(reward) for name, reward in now.rewards.items()}
-        self._keep(said["failed"])
-        return HostStep(rewards=rewards, **said)
+        now = HostStep(**jax.tree.map(self._all, vars(now)))
+        self._keep(now.failed)
+        return now
 
     def failure_text(self, i: int) -> str:
         return self._whys.get(i, "unknown")
@@ -135,9 +134,6 @@ class InTurn(AbstractCopies):
         for seat, lane in enumerate(self._seats.tolist()):
             if failed is not None and failed[lane]:
                 self._whys[lane] = self.inner.failure_text(seat)
-
-
-_PARTS = ("obs", "terminated", "truncated", "active", "failed", "gone")
 
 
 class AbstractHostEnvironment(eqx.Module):

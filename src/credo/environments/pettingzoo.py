@@ -52,8 +52,8 @@ class PettingZoo(AbstractForeignEnvironment):
     last observation. `terminated` of the episode: every agent that took part has terminated; an
     episode that is over otherwise was truncated. Learners take who is not there at the start for
     one that is. The time limit is `max_episode_steps` or the environment's own `max_cycles`,
-    whichever is less, or 1,000 steps if there is none. Whatever goes wrong raises
-    `EnvironmentFailure`, and the next `copies` start a new worker.
+    whichever is less, or 1,000 steps if there is none. Episodes that
+    fail are treated as in `Gymnasium`.
     """
 
     id: str = eqx.field(static=True, converter=names.name_of)

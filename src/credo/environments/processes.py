@@ -141,18 +141,9 @@ def _guardian(module: str, path: str, grace: str, parent: str, *arguments: str) 
     worker = os.fork()
     if worker == 0:
         signal.set_wakeup_fd(-1)
-        for number in (signal.SIGCHLD, signal.SIGTERM):
-            signal.signal(number, signal.SIG_DFL)
         os.close(wake)
         os.close(tell)
-        os.setpgid(0, 0)
-        _control(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != mine:
-            os._exit(1)
-        sys.path[:] = json.loads(path)
-        sys.argv = [module, *arguments]
-        importlib.import_module("credo.environments.processes")._worker = True
-        importlib.import_module(module).main()
+        _run(mine, module, path, arguments)
         return
     _let_go(wake, tell)
     status = None
@@ -160,6 +151,21 @@ def _guardian(module: str, path: str, grace: str, parent: str, *arguments: str) 
         status = _wait(worker, int(parent), wake, float(grace))
     _kill_all(worker)
     _end_like(status)
+
+
+def _run(guardian: int, module: str, path: str, arguments: tuple[str, ...]) -> None:
+    """In the child: its own group, which ends with the guardian, and then what it is for."""
+    for number in (signal.SIGCHLD, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
+    os.setpgid(0, 0)
+    _control(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != guardian:  # it was gone before it could be promised
+        os._exit(1)
+    sys.path[:] = json.loads(path)
+    sys.argv = [module, *arguments]
+    here: Any = importlib.import_module("credo.environments.processes")
+    here._worker = True
+    importlib.import_module(module).main()
 
 
 def _let_go(*kept: int) -> None:

@@ -61,7 +61,9 @@ class Frame:
         agents, dtype = sizes["agents"], np.dtype(sizes["obs_dtype"])
         team = (n,) if agents is None else (n, agents)
         shapes = [team if private else (n,) for _, private in sizes["signals"]]
-        parts = [(shape, np.dtype(np.float64)) for shape in shapes]
+        parts: list[tuple[tuple[int, ...], np.dtype]] = [
+            (shape, np.dtype(np.float64)) for shape in shapes
+        ]
         parts.append(((*team, sizes["obs_size"]), dtype))
         flags = [(n,)] * 3 + ([] if agents is None else [team] * 2)
         self._parts = parts + [(shape, np.dtype(np.bool_)) for shape in flags]
