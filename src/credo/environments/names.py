@@ -7,7 +7,6 @@ same: `foreign_code` says whose code a name would import. No JAX here: a worker 
 """
 
 import contextlib
-import dataclasses
 import importlib
 import importlib.util
 import inspect
