@@ -11,6 +11,7 @@ from credo.environments.adapters import Single
 from credo.environments.foreign import close_all
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.host import EnvironmentFailure
+from credo.environments.wrappers import delayed
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -186,3 +187,10 @@ def test_a_task_says_how_it_takes_actions():
     low, high = here("Numbered").obs_range
     assert (low.tolist(), high.tolist()) == ([0] * 4, [1] * 4)
     assert Single.agents is None
+
+
+def test_a_delayed_task_is_described_as_the_task_itself():
+    env = here("Says", space="bytes", obs="whole")
+    hard = delayed(env)
+    assert (hard.obs_dtype, hard.task_record()) == ("uint8", env.task_record())
+    assert [x.tolist() for x in hard.obs_range] == [[0, 0], [255, 255]]
