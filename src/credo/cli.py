@@ -445,7 +445,21 @@ def _resume(argv: list[str]) -> None:
     in_range(options)
     fields = vars(options) | {"wall_clock": seconds(options.wall_clock)}
     fields |= {"set": changes, "trust": trust, "without_replay": without_replay}
-    _go_on(pathlib.Path(path), _runs(path), **fields)
+    runs = _runs(path)
+    for run in runs if changes else ():
+        _require_changes(run, changes, trust)
+    _go_on(pathlib.Path(path), runs, **fields)
+
+
+def _require_changes(path: pathlib.Path, changes: dict[str, Any], trust: bool) -> None:
+    """End if an algorithm has no such fields, or none with such values: nothing was begun yet."""
+    from .runs import config, loop
+
+    algorithm = loop.Run(path, trust=trust).algorithm
+    try:
+        config.replaced(algorithm, changes)
+    except ValueError as error:
+        fail(f"--set: {error}")
 
 
 @dataclasses.dataclass
