@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compilations import compilations
-from walk import START, HostWalk, Walk
+from walk import START, HostWalk, Walk, Walkers
 
 from credo import rollout, tree
+from credo.environments.host import InTurn
 from credo.environments.probes import Copy, Meet, Remember
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
@@ -431,6 +432,115 @@ def test_a_jax_task_that_says_nan_spoils_no_buffer(what):
     returns = rollout.evaluate(Broken(what=what), population, 2, key=jax.random.key(0)).returns
     for name in returns:
         np.testing.assert_array_equal(returns[name], played.returns[name])
+
+
+class InTurnWalk(HostWalk):
+    at_once: int | None = eqx.field(static=True, default=None)
+
+    def copies(self, n):
+        return InTurn(Walkers(self.at_once, self.spread), n)
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 5])
+def test_copies_in_turn_play_what_they_play_together(at_once):
+    """Bit for bit, although a policy remembers; with members that end early, or act NaN."""
+    weights = jnp.array([0.9, jnp.nan, -0.2, 0.1])
+    population = eqx.filter_vmap(lambda w: Growing(w))(weights)
+    key = jax.random.key(5)
+    for wanted in (0, 2, 3):
+        together = rollout.collect(HostWalk(spread=0.5), population, 3, wanted=wanted, key=key)
+        env = InTurnWalk(spread=0.5, at_once=at_once)
+        apart = rollout.collect(env, population, 3, wanted=wanted, key=key)
+        for x, y in zip(jax.tree.leaves(together), jax.tree.leaves(apart), strict=True):
+            np.testing.assert_array_equal(x, y)
+        assert (wanted == 0) == (rows_of(apart[1]) == 0)
+        lasted = delayed(env)
+        assert lasted.at_once == at_once
+        late = rollout.evaluate(lasted, population, 3, key=key)
+        assert_same(late, rollout.evaluate(HostWalk(spread=0.5), population, 3, key=key))
+
+
+class Growing(AbstractPolicy):
+    """Its action grows from step to step."""
+
+    weight: jax.Array
+
+    def start(self, *, key):
+        return jnp.float32(0.0)
+
+    def __call__(self, obs, carry):
+        return (carry + obs[:1]) * self.weight, carry + 0.1
+
+
+class FailingWalkers(Walkers):
+    """Breaks at reset where the seed is even, and at a step beyond 0.5."""
+
+    def reset(self, seeds, active):
+        obs = super().reset(seeds, active)
+        self.failed = active & (seeds % 2 == 0)
+        return np.where(self.failed[:, None], np.float32(0.0), obs)
+
+    def step(self, actions, active):
+        step = super().step(actions, active)
+        assert not (active & self.failed).any()
+        step.failed = active & (self.x > 0.5)
+        return step
+
+
+class FailingWalk(HostWalk):
+    def copies(self, n):
+        return FailingWalkers(n, self.spread)
+
+
+def test_a_failed_episode_has_a_nan_return_and_is_discarded():
+    env, population = FailingWalk(), constants(0.2, -0.1)
+    played, experience = rollout.collect(env, population, 8, key=jax.random.key(0))
+    steps = np.asarray(played.steps)
+    begun = steps[1] > 0
+    assert 0 < begun.sum() < 8  # of the others the reset failed
+    np.testing.assert_array_equal(steps[0], np.where(begun, 3, 0))  # 0.25 + 3 * 0.1
+    np.testing.assert_array_equal(steps[1], np.where(begun, 6, 0))
+    for returns in played.returns.values():
+        assert np.isnan(returns[0]).all()
+        np.testing.assert_array_equal(np.isfinite(returns[1]), begun)
+    assert rows_of(experience) == 6 * begun.sum()
+    assert np.asarray(experience.transitions.obs)[:, 0].max() <= np.float32(START)
+    returns = rollout.evaluate(env, population, 8, key=jax.random.key(0)).returns
+    for name, other in returns.items():
+        np.testing.assert_array_equal(other, played.returns[name])
+
+
+class ByteWalkers(Walkers):
+    def _obs(self):
+        return np.uint8(255 * np.clip(super()._obs(), 0, 1))
+
+
+class ByteWalk(HostWalk):
+    obs_dtype: ClassVar[str] = "uint8"
+
+    def copies(self, n):
+        return ByteWalkers(n, self.spread)
+
+
+class Divided(AbstractPolicy):
+    weight: jax.Array
+
+    def start(self, *, key):
+        return None
+
+    def __call__(self, obs, carry):
+        assert obs.dtype == jnp.float32
+        return self.weight * obs[:1] / 255.0, carry
+
+
+def test_bytes_are_recorded_as_bytes_and_seen_as_numbers():
+    population = eqx.filter_vmap(Divided)(jnp.array([0.2, -0.5]))
+    played, experience = rollout.collect(ByteWalk(), population, 1, key=jax.random.key(0))
+    rows = experience.transitions
+    assert rows.obs.dtype == rows.next_obs.dtype == np.uint8
+    assert rollout.blank(ByteWalk()).obs.dtype == jnp.uint8
+    assert rows_of(experience) == int(played.steps.sum())
+    np.testing.assert_allclose(rows.action[0, 0], 0.2 * 63 / 255, rtol=1e-6)
 
 
 def test_seeds_of_a_host_task_follow_the_key():

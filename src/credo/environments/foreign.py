@@ -283,8 +283,7 @@ class ForeignCopies(AbstractCopies):
         self._backend = None
         backend.close(0.0)
         for i in np.flatnonzero((gone | self._stranded) & ~culprit).tolist():
-            copy = backend.current[0]
-            self._whys[i] = f"was lost with the worker of copy {copy}: {self._whys[copy]}"
+            self._whys[i] = self._whys[int(backend.current[0])]
         return gone
 
     def _failed(self, name: str, asked: np.ndarray, faults: dict[int, worker.Fault]) -> None:

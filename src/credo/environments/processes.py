@@ -33,8 +33,11 @@ class Refused(RuntimeError):
     """Here nothing may be trained and no process started: `what` is the reason, `fix` the way."""
 
     def __init__(self, what: str, fix: str):
-        super().__init__(f"{what}: {fix}")
+        super().__init__(what, fix)  # so that it can be pickled
         self.what, self.fix = what, fix
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.fix}"
 
 
 def allow(doing: str = "starts training") -> None:

@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -190,11 +191,14 @@ class Environments:
         seen = np.isfinite(frame.obs.reshape(self.n, -1)).all(axis=1)
         paid = [(abs(x.reshape(self.n, -1)) <= LARGEST).all(axis=1) for x in rewards]
         for i in np.flatnonzero(~(seen & np.all(paid, axis=0))).tolist():
-            what = "returned NaN or inf in " + ("the reward" if seen[i] else "an observation")
-            if seen[i] and all(np.isfinite(x[i]).all() for x in rewards):
-                what = "returned a reward that is too large for float32"
+            large = _large(self._api.said[i])
+            if seen[i]:
+                large = all(np.isfinite(x[i]).all() for x in rewards)
+            what = "too large a number for float32" if large else "NaN or inf"
+            where = "the reward" if seen[i] else "an observation"
             how = "guard the division, root or logarithm it is from, or end the episode before"
-            self._broke(frame, i, Fault(what, how))
+            how = "scale it down" if large else how
+            self._broke(frame, i, Fault(f"returned {what} in {where}", how))
 
     def _broke(self, frame: Frame, i: int, fault: Fault) -> None:
         frame.fail(i, fault)
@@ -222,9 +226,17 @@ class Environments:
     usable = True
 
     def close(self, grace: float = 0.0) -> None:
-        for env in self._envs:
+        while self._envs:
             with contextlib.suppress(Exception):  # nobody needs it any more
-                env.close()
+                self._envs.pop().close()
+
+
+def _large(said: Any) -> bool:
+    """Whether an observation holds a finite number that float32 does not."""
+    if isinstance(said, Mapping | tuple | list):
+        return any(map(_large, said.values() if isinstance(said, Mapping) else said))
+    numbers = np.asarray(said, np.float64)
+    return bool((np.isfinite(numbers) & (abs(numbers) > LARGEST)).any())
 
 
 class Lost(Fault):
@@ -253,6 +265,7 @@ class Process:
             with tempfile.TemporaryFile() as shared:
                 shared.truncate(mmap.PAGESIZE)
                 self.current = memoryview(mmap.mmap(shared.fileno(), mmap.PAGESIZE)).cast("i")
+                self.current[1] = 1  # it begins by opening them
                 self._process = _start(requests, replies, shared.fileno())
         except BaseException:
             os.close(self._in)
@@ -391,7 +404,6 @@ def _serve(requests: int, replies: int, current: memoryview) -> None:
             payload = source.read(length)
             try:
                 if kind == OPEN:
-                    current[1] = 1
                     environments = Environments(**json.loads(payload), current=current)
                     reply = _message(OPEN, environments.sizes())
                 else:

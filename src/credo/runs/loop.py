@@ -27,6 +27,7 @@ from jaxtyping import PRNGKeyArray, PyTree
 
 from .. import compilation, require
 from ..compilation import jit
+from ..environments import processes
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..replay import Replay, shapes_alone
 from . import checkpoint, config, files, log, record, screen, weights
@@ -161,6 +162,7 @@ def train(
     from a policy, if weights are no numbers any more, or if an environment outside JAX fails;
     `ValueError` for a seed or a budget that cannot be; `Interrupted` after a signal.
     """
+    processes.allow()
     compilation.enable_cache()
     budget = Budget.of(algorithm, generations, frames, stop_at)
     require.at_least("keep", keep, 1)
@@ -240,6 +242,7 @@ def resume(
 
     **Raises:** as `train`; `RunError` if the task or the files are not those of this run.
     """
+    processes.allow()
     compilation.enable_cache()
     run = Run(path, trust=trust)
     with lock(run.path):
