@@ -742,7 +742,7 @@ def _of_user(name: str, call: Any) -> Any:
         )
     except Exception as error:
         place, what = ending.place(error), f"{type(error).__name__}: {ending.first(error)}"
-        if place or not isinstance(error, TypeError):
+        if place or not (isinstance(error, TypeError) and isinstance(call, type)):
             fail(f"cannot use {name}: {place or 'it'} raised {what}")
         fail(
             f"{name} cannot be made without arguments ({error}): give every field a default, and "
