@@ -1,23 +1,27 @@
 """The command line, from the help text to a report; wrong use ends with a suggestion."""
 
 import dataclasses
+import importlib
 import json
+import operator
 import pathlib
 import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import textwrap
 import warnings
 
 import pytest
+from jax.errors import JaxRuntimeError
 
-from credo import cli
+from credo import cli, require
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Meet, Remember
 from credo.networks.mlp import MLP
 from credo.networks.team import Team
-from credo.runs.loop import Run
+from credo.runs.loop import Interrupted, Run, RunError
 
 TRAIN = (
     "train neuroevolution sequence-classification --depth 2 --min-gap 1 --max-gap 2 "
@@ -121,6 +125,29 @@ def test_list_names_everything(credo):
         ("train td3 Hoper-v5", "no task 'Hoper-v5'", "did you mean 'Hopper-v5'?"),
         ("train td3 Pendulum-v1 --preset td4", "no preset 'td4' of td3", "'td3'?"),
         (f"{TRAIN} --seeds 0", "--seeds is 0: it must be at least 1", ""),
+        (f"{TRAIN} --keep 0", "--keep is 0: it must be at least 1", ""),
+        (f"{TRAIN} --seed -1", "--seed is -1: a seed must lie in 0 … 4294967295", ""),
+        (f"{TRAIN} --seed 4294967296", "a seed must lie in 0 … 4294967295", ""),
+        (f"{TRAIN} --seed 1180591620717411303424", "a seed must lie in 0 … 4294967295", ""),
+        (f"{TRAIN} --seed 4294967295 --seeds 2", "--seed is 4294967295 … 4294967296: a seed", ""),
+        (f"{TRAIN} --checkpoint-every nan", "--checkpoint-every is nan: it must be at least 0", ""),
+        (f"{TRAIN} --stop-at nan", "--stop-at is nan", ""),
+        (f"{TRAIN} --kwargs a=1", "SequenceClassification has no --kwargs", "see --help"),
+        ("check Pendulum-v1 --kwargs", "--kwargs needs settings", "NAME=VALUE"),
+        ("check Pendulum-v1 --kwargs g", "--kwargs: g has no value", "write g=VALUE"),
+        ("check Pendulum-v1 --kwargs 1=g", "--kwargs: '1=g' is no setting", "NAME=VALUE"),
+        ("check Pendulum-v1 --kwargs g=[1]", "a number, a string, a bool, None or a tuple", ""),
+        ("resume nowhere --keep 0", "--keep is 0: it must be at least 1", ""),
+        ("resume nowhere --generations 0", "--generations is 0: it must be at least 1", ""),
+        ("resume nowhere --set gamma", "--set is 'gamma'", "as learner.actor_lr=1e-4"),
+        ("watch nowhere --episodes 0", "--episodes is 0: it must be at least 1", ""),
+        ("watch nowhere --seed -1", "a seed must lie in 0 … 4294967295", ""),
+        ("watch nowhere --fps 0", "--fps is 0.0: it must be more than 0", ""),
+        ("report nowhere --out page.html", "no flag '--out'", "did you mean '--output'?"),
+        ("list tasks now", "takes one word", ""),
+        ("check subprocess:Popen", "subprocess:Popen is no task", ""),
+        ("check os:system", "os:system is no task", ""),
+        ("reproduce fig-3.4a --runs 0", "--runs is 0: it must be at least 1", ""),
         ("reproduce fig-3.4", "no experiment 'fig-3.4'", "did you mean 'fig-3.4"),
         ("reproduce fig-3.4a --budget quik", "no budget 'quik'", "did you mean 'quick'?"),
     ],
@@ -165,6 +192,94 @@ def test_what_cannot_be_done_ends_in_one_line(credo, words, told):
     assert err.startswith("credo: ")
     assert told in err
     assert len(err.splitlines()) == 1
+
+
+def user_exit(_):
+    sys.exit(0)
+
+
+def user_error(_):
+    return {}["x"]
+
+
+def allocate(_):
+    raise JaxRuntimeError(
+        "RESOURCE_EXHAUSTED: Out of memory allocating 100000000000 bytes.\nand so"
+    )
+
+
+def raising(error):
+    def command(_):
+        raise error
+
+    return command
+
+
+@pytest.mark.parametrize(
+    ("command", "code", "told"),
+    [
+        (raising(KeyboardInterrupt()), 130, "credo: stopped"),
+        (raising(MemoryError()), 1, "credo: not enough memory: MemoryError. Give a smaller"),
+        (allocate, 1, "memory: RESOURCE_EXHAUSTED: Out of memory allocating 100000000000 bytes. G"),
+        (raising(PermissionError(13, "Permission denied", "x")), 1, "Permission denied: 'x'"),
+        (raising(RunError("no run")), 1, "credo: no run"),
+        (raising(Interrupted("stopped and saved", 143)), 143, "credo: stopped and saved"),
+        (lambda _: require.at_least("depth", 0, 1), 2, "credo: depth is 0: it must be at least 1"),
+        (user_exit, 1, "test_cli.py:"),
+        (user_exit, 1, "ends Python (exit code 0)"),
+        (user_error, 1, "raised KeyError: 'x'; the traceback is in "),
+        (operator.add, 1, "credo: internal error: TypeError: add expected 2 arguments, got 1; the"),
+    ],
+)
+def test_whatever_a_command_raises_ends_in_one_line(credo, monkeypatch, command, code, told):
+    monkeypatch.setattr(cli, "_list", command)
+    ended, out, err = credo("list")
+    assert (ended, out, len(err.splitlines())) == (code, "", 1)
+    assert told in err
+
+
+def test_what_nobody_foresaw_leaves_its_traceback(credo, monkeypatch, tmp_path):
+    monkeypatch.setattr(cli, "_list", user_error)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    _, _, err = credo("list")
+    (log,) = tmp_path.iterdir()
+    assert err.endswith(f"the traceback is in {log}\n")
+    assert "Traceback" in log.read_text()
+    assert "KeyError: 'x'" in log.read_text()
+
+
+def test_what_a_file_says_moves_no_cursor(credo, monkeypatch):
+    monkeypatch.setattr(cli, "_list", raising(RunError("\x1b[2Jclean")))
+    assert credo("list")[2] == "credo: \\x1b[2Jclean\n"
+
+
+def sh(script: str, **options) -> tuple[int, str]:
+    """A shell's exit code for `credo …`, and all that was said."""
+    script = script.replace("credo", f"{sys.executable} -m credo")
+    ran = subprocess.run(["bash", "-c", script], capture_output=True, text=True, **options)
+    return ran.returncode, ran.stdout + ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("script", "code", "said"),
+    [
+        ("credo list | head -0; exit ${PIPESTATUS[0]}", 141, ""),
+        ("credo list >&-", 0, ""),
+        ("credo trian 2>&-", 2, ""),
+        ("credo trian 2>&1 | head -0; exit ${PIPESTATUS[0]}", 2, ""),
+        (
+            "mkdir gone; cd gone; rmdir ../gone; credo list",
+            1,
+            "credo: this folder is not there any",
+        ),
+        ("credo list tasks > /dev/full", 1, "credo: [Errno 28] No space left on device"),
+    ],
+)
+def test_streams_and_folders_that_are_gone(script, code, said, tmp_path):
+    ended, told = sh(script, cwd=tmp_path)
+    assert ended == code
+    assert told.startswith(said)
+    assert len(told.splitlines()) == bool(said)
 
 
 @pytest.mark.parametrize("command", ["resume", "evaluate", "report", "check", "reproduce", "train"])
@@ -281,6 +396,14 @@ def test_report_is_a_page_about_the_runs(credo, run, tmp_path):
     assert f"credo report {run}" in re.sub("<[^>]*>", "", page)
 
 
+def test_flags_may_not_change_what_a_champion_is_made_for(credo, hosted):
+    code, out, err = credo(f"evaluate {hosted} --id MountainCarContinuous-v0")
+    assert (code, out) == (2, "")
+    assert "with these flags the task has 2 numbers in an observation: its champion cannot" in err
+    code, out, _ = credo(f"evaluate {hosted} --episodes 2 --kwargs g=0.0")
+    assert code == 0
+
+
 def test_several_seeds_are_trained_in_processes_of_their_own(credo, run, tmp_path):
     code, out, _ = credo(f"{TRAIN} --generations 10 --seed 2 --seeds 2 --path {tmp_path / 'runs'}")
     assert code == 0
@@ -291,6 +414,70 @@ def test_several_seeds_are_trained_in_processes_of_their_own(credo, run, tmp_pat
     code, *_ = credo("report", *map(str, runs), f"-o {tmp_path / 'both.html'}")
     assert code == 0
     assert "Neuroevolution: 2, 3" in (tmp_path / "both.html").read_text()
+
+
+@pytest.fixture
+def seeds(run, tmp_path, monkeypatch):
+    """A folder of two runs, as `--seeds` leaves it."""
+    monkeypatch.chdir(tmp_path)
+    for seed in (3, 11):
+        shutil.copytree(run, tmp_path / "several" / f"seed-{seed}")
+    return "several"
+
+
+def test_a_folder_of_runs_is_reported_in_itself(credo, seeds):
+    page = pathlib.Path(seeds) / "report.html"
+    for words in (seeds, f"{seeds}/seed-3 {seeds}/seed-11"):
+        assert credo(f"report {words}") == (0, f"page: {page}\n", "")
+        page.unlink()
+    assert not list(pathlib.Path(seeds).glob("seed-*/report.html"))
+
+
+def test_a_folder_of_runs_is_evaluated_run_by_run_and_together(credo, seeds):
+    code, out, _ = credo(f"evaluate {seeds} --episodes 20")
+    lines = out.splitlines()
+    assert (code, lines[0]) == (0, f"{seeds}/seed-3: 20 fresh episodes, {MEAN}")
+    assert lines[6] == f"{seeds}/seed-11: 20 fresh episodes, {MEAN}"
+    assert lines[12] == f"{seeds}: 2 runs, mean ± standard error over runs"
+    for alone, together in zip(lines[1:4], lines[13:], strict=True):  # the same run twice
+        assert together.split()[1:] == [alone.split()[1], "±", "0"]
+
+
+@pytest.mark.parametrize("command", ["watch", "export"])
+def test_of_a_folder_of_runs_one_must_be_named(credo, seeds, command):
+    code, out, err = credo(f"{command} {seeds}")
+    assert (code, out) == (2, "")
+    assert f"{seeds} holds 2 runs: name one of them, as in credo {command} {seeds}/seed-3" in err
+    assert f"{seeds}/seed-11" in err
+
+
+def test_every_run_of_a_folder_is_resumed(credo, seeds, monkeypatch):
+    given = []
+    monkeypatch.setattr("credo.runs.executor.run", lambda jobs, **_: given.extend(jobs))
+    assert credo(f"resume {seeds} --generations 20 --keep 2")[0] == 0
+    assert [(job.path.name, job.seed) for job in given] == [("seed-3", 3), ("seed-11", 3)]
+    assert [(job.generations, job.frames, job.keep) for job in given] == [(20, None, 2)] * 2
+    given.clear()
+    assert credo(f"resume {seeds} --stop-at 2")[0] == 0
+    assert [(job.generations, job.stop_at) for job in given] == [(10, 2.0)] * 2
+    assert [job.finished() for job in given] == [True, True]
+
+
+def test_what_resume_is_told_reaches_the_loop(credo, seeds, run, monkeypatch):
+    told = []
+    resumed = lambda path, **fields: told.append((path, fields)) or Run(path)  # noqa: E731
+    monkeypatch.setattr("credo.runs.loop.resume", resumed)
+    words = "--set mutation.strength=0.5 --set episodes=5 --trust --without-replay"
+    assert credo(f"resume {run} {words} --wall-clock 2m")[0] == 0
+    assert credo(f"resume {seeds} {words}")[0] == 0
+    assert [path for path, _ in told] == [run, *sorted(pathlib.Path(seeds).glob("*"), reverse=True)]
+    for _, fields in told:
+        assert fields["set"] == {"mutation.strength": 0.5, "episodes": 5}
+        assert (fields["trust"], fields["without_replay"]) == (True, True)
+    assert told[0][1]["wall_clock"] == 120.0
+    code, _, err = credo(f"resume {run} --set mutation.strngth=0.5")
+    assert code == 2
+    assert "did you mean 'strength'?" in err
 
 
 def test_every_algorithm_is_made_of_its_preset():
@@ -393,6 +580,9 @@ TASK = """
         def __init__(self, shape):
             self.shape = shape
 
+    def swing(g: float = 10.0):
+        return gymnasium.make("Pendulum-v1", g=g, max_episode_steps=9)
+
     class Crumbling(gymnasium.Env):
         observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
         action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,), np.float32)
@@ -435,6 +625,47 @@ def test_a_package_that_registers_its_tasks_is_imported(credo, tmp_path, monkeyp
     assert "cannot import 'registers_nothing:Mine-v3'" in err
 
 
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("import sys; sys.exit(0)", "mine_1.py:1 ends Python (exit code 0): put that under if"),
+        ("def x(:", "mine_1.py:1: invalid syntax"),
+        ("import os\nundefined", "mine_1.py:2 raised NameError: name 'undefined' is not defined"),
+        ("import not_there", "No module named 'not_there'"),
+        ("X = 3", "mine_1:X is no task"),
+        ("def X():\n  1 / 0", "mine_1.py:2 raised ZeroDivisionError: division by zero"),
+        ("def X():\n  return 3", "mine_1:X is no task"),
+    ],
+)
+@pytest.mark.parametrize("command", ["check", "train ea"])
+def test_a_module_that_cannot_be_used_is_a_failure(
+    credo, tmp_path, monkeypatch, text, told, command
+):
+    (tmp_path / "mine_1.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "mine_1", raising=False)
+    importlib.invalidate_caches()
+    code, out, err = credo(f"{command} mine_1:X")
+    assert (code, out) == (2, "")
+    assert told in err
+    assert len(err.splitlines()) == 1
+
+
+def test_a_function_makes_a_task_with_the_settings_it_is_given(credo, own_tasks, tmp_path):
+    task = f"{own_tasks}:swing"
+    for settings in ("--kwargs g=5.0", "--kwargs.g 5.0", "--kwargs g 5.0"):
+        code, out, _ = credo(f"check {task} --in-process True {settings}")
+        assert (code, out) == (0, f"{task}: 0 problems found\n")
+    code, _, err = credo(f"check {task} --in-process True --kwargs h=5")
+    assert code == 2
+    assert f"cannot use {task}: it raised TypeError: swing() got an unexpected" in err
+    flags = "--population-size 3 --elite-fraction 0.4 --network.hidden 4 --generations 1"
+    words = f"train ea {task} --kwargs g=5.0 --in-process True {flags} --test-episodes 1"
+    assert credo(f"{words} --path {tmp_path / 'run'}")[0] == 0
+    env = Run(tmp_path / "run").algorithm.env
+    assert (env.id, env.kwargs, env.max_steps) == (task, (("g", 5.0),), 9)
+
+
 def test_check_finds_nothing_wrong_with_a_good_task(credo, own_tasks):
     assert credo("check", f"{own_tasks}:Good") == (0, f"{own_tasks}:Good: 0 problems found\n", "")
 
@@ -467,7 +698,7 @@ def test_a_task_that_needs_arguments_is_refused(credo, own_tasks):
     assert "cannot be made without arguments" in err
 
 
-def test_a_task_of_ones_own_is_trained_and_resumed(credo, own_tasks, tmp_path):
+def test_a_task_of_ones_own_is_trained_and_resumed(credo, own_tasks, tmp_path, monkeypatch):
     flags = "--population-size 4 --episodes 2 --test-episodes 2 --network mlp --tensorboard False"
     path = tmp_path / "run"
     words = f"train neuroevolution {own_tasks}:Good {flags} --generations 1 --path {path}"
@@ -477,6 +708,23 @@ def test_a_task_of_ones_own_is_trained_and_resumed(credo, own_tasks, tmp_path):
     code, out, _ = credo(f"resume {path} --generations 2")
     assert code == 0
     assert "generation 2," in out
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "somebody"))  # another user's key
+    for command in ("resume", "evaluate", "watch", "export"):
+        code, out, err = credo(f"{command} {path}")
+        assert (code, out) == (1, "")
+        assert f"names {own_tasks}:Good, which is somebody's own code" in err
+        assert "--trust" in err
+    assert credo(f"evaluate {path} --episodes 2 --trust")[0] == 0
+    assert credo(f"report {path}")[0] == 0  # imports nothing
+
+
+def test_learners_without_memory_refuse_networks_that_have_it(credo, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for words in ("td3 Pendulum-v1 --network gru", "sac Pendulum-v1 --network mmu"):
+        code, out, err = credo(f"train {words} --frames 60 --in-process True")
+        assert (code, out) == (2, "")
+        assert re.search("credo: .*(network such as|needs an) MLP", err.splitlines()[-1])
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_run_that_ends_before_it_learns_is_mentioned(credo, tmp_path):
@@ -491,9 +739,9 @@ def test_a_run_that_ends_before_it_learns_is_mentioned(credo, tmp_path):
 
 def test_a_task_is_checked_with_the_flags_it_is_given(credo, own_tasks):
     task = f"{own_tasks}:Crumbling"
-    assert "line --max-episode-steps 1000" in credo("check", task)[1]
-    _, out, _ = credo("check", task, "--max-episode-steps", "2")
-    assert "no time limit" not in out
+    assert "its floor gave way" in credo("check", task)[1]
+    code, out, _ = credo("check", task, "--max-episode-steps", "2")
+    assert (code, out) == (0, f"{task}: 0 problems found\n")
 
 
 def test_a_champion_of_another_network_is_refused_with_both(credo, tmp_path):

@@ -54,3 +54,35 @@ def test_results_are_float32_and_the_name_is_kept(traced):
 def test_the_cache_lies_where_the_user_said():
     compilation.enable_cache()
     assert jax.config.jax_compilation_cache_dir == str(compilation.cache_directory() / "xla")
+
+
+@pytest.mark.parametrize("name", ["CREDO_CACHE", "XDG_CACHE_HOME", "HOME"])
+def test_without_a_folder_to_write_in_nothing_is_kept_and_that_is_said_once(
+    monkeypatch, tmp_path, name
+):
+    for variable in ("CREDO_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert compilation.cache_directory() == tmp_path / ".cache" / "credo"
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv(name, str(tmp_path / "file"))
+    assert compilation.cache_directory() is None
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    compilation.enable_cache.cache_clear()
+    try:
+        with pytest.warns(UserWarning, match="set CREDO_CACHE to a folder that can"):
+            compilation.enable_cache()
+        compilation.enable_cache()  # a warning would be an error
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_a_user_without_a_home_has_no_cache(monkeypatch):
+    def nobody():
+        raise RuntimeError("Could not determine home directory.")
+
+    for variable in ("CREDO_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr("pathlib.Path.home", nobody)
+    assert compilation.cache_directory() is None

@@ -445,7 +445,21 @@ def _resume(argv: list[str]) -> None:
     in_range(options)
     fields = vars(options) | {"wall_clock": seconds(options.wall_clock)}
     fields |= {"set": changes, "trust": trust, "without_replay": without_replay}
-    _go_on(pathlib.Path(path), _runs(path), **fields)
+    runs = _runs(path)
+    for run in runs if changes else ():
+        _require_changes(run, changes, trust)
+    _go_on(pathlib.Path(path), runs, **fields)
+
+
+def _require_changes(path: pathlib.Path, changes: dict[str, Any], trust: bool) -> None:
+    """End if an algorithm has no such fields, or none with such values: nothing was begun yet."""
+    from .runs import config, loop
+
+    algorithm = loop.Run(path, trust=trust).algorithm
+    try:
+        config.replaced(algorithm, changes)
+    except ValueError as error:
+        fail(f"--set: {error}")
 
 
 @dataclasses.dataclass
@@ -728,7 +742,7 @@ def _of_user(name: str, call: Any) -> Any:
         )
     except Exception as error:
         place, what = ending.place(error), f"{type(error).__name__}: {ending.first(error)}"
-        if place or not isinstance(error, TypeError):
+        if place or not (isinstance(error, TypeError) and isinstance(call, type)):
             fail(f"cannot use {name}: {place or 'it'} raised {what}")
         fail(
             f"{name} cannot be made without arguments ({error}): give every field a default, and "

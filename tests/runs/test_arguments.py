@@ -70,3 +70,28 @@ def test_too_many_names_are_searched_but_not_listed(capsys):
         err = capsys.readouterr().err
         assert told in err
         assert "Hopper, " not in err
+
+
+@pytest.mark.parametrize(
+    ("words", "pairs", "rest"),
+    [
+        ("--kwargs a=1 b=x", {"a": 1, "b": "x"}, ""),
+        ("--depth 3 --kwargs a 1 b False --seed 4", {"a": 1, "b": False}, "--depth 3 --seed 4"),
+        ("--kwargs.a 0.5 --kwargs.b=None --seed 4", {"a": 0.5, "b": None}, "--seed 4"),
+        ("--kwargs=a=(1,2) --kwargs b=-1", {"a": (1, 2), "b": -1}, ""),
+        ("--kwargs a=m:f b='8' c=8x8", {"a": "m:f", "b": "8", "c": "8x8"}, ""),
+        ("--kwargs a=1 a=1e3", {"a": 1000}, ""),
+        ("--kwargsx=1", {}, "--kwargsx=1"),
+    ],
+)
+def test_settings_by_name_are_taken_out_of_the_words(words, pairs, rest):
+    found, left = arguments.pop_pairs(words.split(), "--kwargs")
+    assert (found, left) == (pairs, rest.split())
+    assert [type(value) for value in found.values()] == [type(value) for value in pairs.values()]
+
+
+def test_every_change_is_taken_out_of_the_words():
+    words = "--set learner.actor-lr=1e-4 --keep 2 --set=signal=local --set a.0.b=True"
+    changes, rest = arguments.pop_changes(words.split(), "--set")
+    assert changes == {"learner.actor_lr": 1e-4, "signal": "local", "a.0.b": True}
+    assert rest == ["--keep", "2"]

@@ -1,8 +1,10 @@
 """The page about runs: seeds together, settings apart, scores beside floor and ceiling."""
 
 import json
+import types
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from credo.networks.mmu import MMU
 from credo.runs import config, evaluation, log, report
 from credo.runs.loop import Run, RunError, train
 from credo.runs.page import Page
+from credo.types import Evaluation
 
 TASK = SequenceClassification(depth=2, min_gap=1, max_gap=2)
 ALGORITHM = Neuroevolution(TASK, MMU(hidden=3), population_size=10, episodes=4, test_episodes=6)
@@ -99,6 +102,21 @@ def test_a_task_without_a_known_floor_says_so(page_of, tmp_path):
     assert page.lead == f"Task: {config.brief(config.to_tree(Copy()))}."
 
 
+def test_the_page_of_a_stranger_s_run_imports_nothing(page_of, tmp_path, monkeypatch):
+    (tmp_path / "strange_1.py").write_text("open('executed', 'w')\nclass Task:\n    pass\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    named = config.to_tree(Neuroevolution(Copy(), MMU(hidden=3), test_episodes=6))
+    hosted = named | {"env": config.to_tree(Gymnasium("strange_1:Task"))}
+    own = named | {"env": {"class": "strange_1:Task"}, "network": {"class": "strange_1:Task"}}
+    monkeypatch.setattr(config, "to_tree", lambda tree: tree)
+    for name, algorithm in {"hosted": hosted, "own": own}.items():
+        page = page_of(fake(tmp_path / name, algorithm, 0, [0.0, 0.5]))
+        assert "Task" in page.lead
+        assert page.sections[2].rows[0][4] == "0.500"
+    assert not (tmp_path / "executed").exists()
+
+
 def test_a_run_without_a_generation_is_refused(tmp_path):
     path = fake(tmp_path / "a", ALGORITHM, 0, [0.5])
     (path / "metrics.csv").unlink()
@@ -166,3 +184,29 @@ def test_many_episodes_outside_jax_are_played_in_turn(monkeypatch):
     assert not np.array_equal(returns[:, :20], returns[:, 20:40])
     again = evaluation.in_turn(task, policies, 30, key=jax.random.key(1))
     np.testing.assert_array_equal(again.returns["reward"], played.returns["reward"][:, :30])
+
+
+def test_agents_of_one_episode_are_one_value_of_its_team():
+    """Returns of two episodes: 1, 3, 5 and 7, 9, 11. The team's means are 3 and 9."""
+    score = evaluation._score(np.array([[1.0, 3.0, 5.0], [7.0, 9.0, 11.0]]))
+    assert (score.mean, score.agents) == (6.0, (4.0, 6.0, 8.0))
+    assert score.error == pytest.approx(3.0)  # std 4.243 over the root of 2 episodes
+
+
+def test_failed_episodes_are_left_out_and_counted(run, monkeypatch):
+    nan = float("nan")
+    returns = {"team": jnp.array([[1.0, nan, 3.0]]), "own": jnp.array([[[1.0, 2.0]] * 3])}
+    played = Evaluation(returns, jnp.array([[4, 9, 6]]))
+    monkeypatch.setattr(evaluation, "in_turn", lambda *_, **__: played)
+    task = types.SimpleNamespace(signals=("team", "own"))
+    lines, result = evaluation.describe(run, task, 3, 0)
+    assert (result.episodes, result.failed, result.steps) == (2, 1, 5.0)
+    assert lines == [
+        f"{run.path}: 2 fresh episodes, mean ± standard error over episodes",
+        "  1 of 3 episodes failed and are left out",
+        "  team             2 ± 1",
+        "  own              1.5 ± 0 (mean of 2 agents)",
+        "    agent 0        1",
+        "    agent 1        2",
+        "  steps            5.0",
+    ]
