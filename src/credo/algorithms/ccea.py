@@ -29,7 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
-from ..compilation import jit
+from ..compilation import float32, jit
 from ..environments.base import AbstractEnvironment
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.extinction import Extinction
@@ -136,6 +136,7 @@ class CCEA(eqx.Module):
             jax.random.split(key, self.population_size if size is None else size)
         )
 
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> CCEAState:
         # 1: Initialize M populations of k neural network policies.
         keys = jax.random.split(key, self.agents)
@@ -143,6 +144,7 @@ class CCEA(eqx.Module):
         first = jnp.zeros((self.agents, 1), jnp.int32)
         return CCEAState(populations, tree.take(drafted(self, populations, first), 0))
 
+    @float32()
     def generation(self, state: CCEAState, *, key: PRNGKeyArray) -> tuple[CCEAState, Metrics]:
         """Lines 4-21 of Algorithm 4, and the test of the champion team."""
         team_key, play_key, breed_key, test_key = jax.random.split(key, 4)
@@ -217,7 +219,7 @@ def assigned(
     members: Int[Array, "agents teams"],
     returns: Float[Array, "teams episodes *agents"],
 ) -> Float[Array, "agents k"]:
-    """Fitness of every individual, from the teams that it was in; NaN if there was none.
+    """Fitness of every individual, from the teams that it was in; -inf if there was none.
 
     **Arguments:** `members[i, t]`: who of population i is in team t. `returns` of a private signal
     have an axis of agents.
@@ -228,5 +230,7 @@ def assigned(
     mine = members[:, None, :] == jnp.arange(k)[None, :, None]  # [agents, k, teams]
     if ccea.assignment == "best":
         best = jnp.max(jnp.where(mine, rankable(reward)[:, None], -jnp.inf), axis=2)
-        return jnp.where(jnp.any(mine, axis=2), best, jnp.nan)
-    return jnp.mean(jnp.broadcast_to(reward[:, None], mine.shape), axis=2, where=mine)
+    else:
+        every = jnp.broadcast_to(reward[:, None], mine.shape)
+        best = jnp.mean(every, axis=2, where=mine)
+    return jnp.where(jnp.any(mine, axis=2), best, -jnp.inf)

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, rollout, tree
-from ..compilation import jit, when
+from ..compilation import float32, jit, when
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.lineage import Lineage
 from ..evolution.mutation import AbstractMutation, MatrixMutation
@@ -174,12 +174,14 @@ class ERL(eqx.Module):
         """e = int(ψ·k)"""
         return int(self.elite_fraction * self.population_size)
 
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> ERLState:
         return begin(self, key=key)
 
     def warm(self, state: ERLState, policy: AbstractPolicy) -> ERLState:
         return warm(self, state, policy)
 
+    @float32()
     def generation(self, state: ERLState, *, key: PRNGKeyArray) -> tuple[ERLState, Metrics]:
         """One pass of the outer loop of Algorithms 6 and 10."""
         evaluate_key, breed_key, explore_key, learn_key, allocate_key, test_key = jax.random.split(
@@ -273,7 +275,7 @@ def begin(hybrid: Hybrid, *, key: PRNGKeyArray) -> ERLState:
         Ledger.empty(q),
         even(hybrid.workers, max(q, 1)),
         tree.take(population, 0),
-        jnp.float32(jnp.nan),
+        jnp.float32(-jnp.inf),
         *(jnp.int32(0) for _ in range(3)),
     )
 

@@ -32,6 +32,7 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
 from .. import require
+from ..compilation import float32
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.mutation import AbstractMutation
 from ..evolution.selection import AbstractSelection, Tournament
@@ -118,6 +119,7 @@ class MERL(eqx.Module):
         """The reward that evolution maximises."""
         return self.fitness or self.env.reported
 
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> ERLState:
         # 1-4: a population of k multi-head teams; learners with a shared critic; replay buffers.
         return begin(self, key=key)
@@ -125,6 +127,7 @@ class MERL(eqx.Module):
     def warm(self, state: ERLState, policy: AbstractPolicy) -> ERLState:
         return warm(self, state, policy)
 
+    @float32()
     def generation(self, state: ERLState, *, key: PRNGKeyArray) -> tuple[ERLState, Metrics]:
         """One pass of the outer loop of Algorithm 13."""
         rollout_key, breed_key, explore_key, learn_key, test_key = jax.random.split(key, 5)

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
-from ..compilation import jit
+from ..compilation import float32, jit
 from ..environments.base import AbstractEnvironment, AbstractSequenceTask
 from ..environments.sequence_classification import SequenceClassification
 from ..evolution.agents import AgentCrossover
@@ -185,6 +185,7 @@ class Neuroevolution(eqx.Module):
             jax.random.split(key, self.population_size if size is None else size)
         )
 
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> NeuroevolutionState:
         # 1: Initialize a population of k neural networks.
         population = self.new_population(key=key)
@@ -194,6 +195,7 @@ class Neuroevolution(eqx.Module):
             population, tree.take(population, 0), jnp.zeros(k), jnp.zeros(k, jnp.int32), level
         )
 
+    @float32()
     def generation(
         self, state: NeuroevolutionState, *, key: PRNGKeyArray
     ) -> tuple[NeuroevolutionState, Metrics]:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, rollout, tree
-from ..compilation import when
+from ..compilation import float32, when
 from ..learners.base import AbstractLearner, learn
 from ..learners.sac import SAC
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, TEAM, ddpg, maddpg, matd3
@@ -96,13 +96,14 @@ class OffPolicy(eqx.Module):
         names = ("td3", "ddpg", "sac", "matd3", "maddpg")
         return {name: getattr(cls, name) for name in names}
 
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> OffPolicyState:
         env = self.env
         require.continuous(env, self.learner)
         learner = self.learner.init(self.network, *env.sizes, key=key)
         replay = Replay.empty(blank(env), self.replay_capacity)
         actor = self.learner.actor(learner)
-        return OffPolicyState(learner, replay, actor, jnp.float32(jnp.nan), jnp.int32(0))
+        return OffPolicyState(learner, replay, actor, jnp.float32(-jnp.inf), jnp.int32(0))
 
     def warm(self, state: OffPolicyState, policy: AbstractPolicy) -> OffPolicyState:
         """`state` that goes on from a saved policy of the same network, without random actions. Its
@@ -111,6 +112,7 @@ class OffPolicy(eqx.Module):
         frames = jnp.int32(self.start_frames)
         return OffPolicyState(learner, state.replay, policy, state.score, frames)
 
+    @float32()
     def generation(
         self, state: OffPolicyState, *, key: PRNGKeyArray
     ) -> tuple[OffPolicyState, Metrics]:
@@ -137,7 +139,8 @@ class OffPolicy(eqx.Module):
 
         # Test the actor without noise, now and then.
         actor = self.learner.actor(learner)
-        due = (frames // self.test_every > state.frames // self.test_every) | jnp.isnan(state.score)
+        due = frames // self.test_every > state.frames // self.test_every
+        due = due | ~jnp.isfinite(state.score)  # -inf: never tested
         score = when(
             due,
             lambda: rollout.score(self.env, actor, self.test_episodes, key=test_key),

@@ -17,8 +17,8 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .. import require, rollout, tree
-from ..compilation import jit, when
-from ..learners.base import act, adam, adam_state, require_memoryless
+from ..compilation import float32, jit, when
+from ..learners.base import act, adam, adam_state, averaged, require_memoryless
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import Explorer, GaussianNoise
 from ..networks.mlp import MLP, Critic, CriticNetwork
@@ -109,6 +109,7 @@ class PPO(eqx.Module):
         """Settings by name, for the command line."""
         return {"ppo": cls.ppo}
 
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> PPOState:
         env = self.env
         require.continuous(env, self)
@@ -122,9 +123,10 @@ class PPO(eqx.Module):
         replay = Replay.empty(blank(env), min(most, self.horizon + 8 * env.max_steps))
         opt = adam_state((actor, critic))
         length = jnp.float32(min(self.horizon, env.max_steps))
-        score = jnp.float32(jnp.nan)
+        score = jnp.float32(-jnp.inf)
         return PPOState(actor, critic, opt, replay, mean, score, length, jnp.int32(0))
 
+    @float32()
     def generation(self, state: PPOState, *, key: PRNGKeyArray) -> tuple[PPOState, Metrics]:
         explore_key, learn_key, test_key = jax.random.split(key, 3)
 
@@ -153,7 +155,8 @@ class PPO(eqx.Module):
             self, networks, state.optimizer, replay, key=learn_key
         )
 
-        due = (frames // self.test_every > state.frames // self.test_every) | jnp.isnan(state.score)
+        due = frames // self.test_every > state.frames // self.test_every
+        due = due | ~jnp.isfinite(state.score)  # -inf: never tested
         score = when(
             due,
             lambda: rollout.score(self.env, actor.mean, self.test_episodes, key=test_key),
@@ -210,8 +213,7 @@ def improve(
     loop = jax.lax.fori_loop(0, ppo.epochs, epoch, (weights, optimizer, zeros))
     weights, opt, total = loop
     actor, critic = eqx.combine(weights, static)
-    count = (ppo.epochs * batches).astype(jnp.float32)
-    return actor, critic, opt, {name: x / count for name, x in total.items()}
+    return actor, critic, opt, averaged(total, ppo.epochs * batches)
 
 
 def prepare(ppo: PPO, networks: tuple[Actor, CriticNetwork], replay: Replay) -> Sample:

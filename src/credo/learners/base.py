@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from ..compilation import jit
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..replay import Replay
-from ..types import Batch, Metrics
+from ..types import NOTHING, Batch, Metrics
 
 
 class AbstractLearner(eqx.Module):
@@ -63,11 +63,11 @@ def learn(
 
     **Arguments:** `signal`: what a learner optimises that names no reward itself. `key`.
 
-    **Returns:** the new state and the mean of each metric; NaN if there was no update.
+    **Returns:** the new state and the mean of each metric; NOTHING if there was no update.
     """
     if not isinstance(updates, jax.core.Tracer) and updates == 0:
         # Nothing need be compiled for it: the first fitness of a run comes sooner.
-        return state, {name: jnp.float32(jnp.nan) for name in learner.metrics}
+        return state, {name: jnp.float32(NOTHING) for name in learner.metrics}
     return _learn(learner, state, replay, updates, **rest)
 
 
@@ -95,8 +95,13 @@ def _learn(
 
     zeros = {name: jnp.float32(0.0) for name in learner.metrics}
     dynamic, total = jax.lax.fori_loop(0, updates, body, (dynamic, zeros))
-    count = updates.astype(jnp.float32)
-    return eqx.combine(dynamic, static), jax.tree.map(lambda x: x / count, total)
+    return eqx.combine(dynamic, static), averaged(total, updates)
+
+
+def averaged(total: Metrics, count: Int[Array, ""]) -> Metrics:
+    """Means of sums over `count`; NOTHING if that is 0."""
+    n = jnp.maximum(count, 1).astype(jnp.float32)
+    return jax.tree.map(lambda x: jnp.where(count > 0, x / n, NOTHING), total)
 
 
 def adam(

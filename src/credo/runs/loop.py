@@ -34,6 +34,7 @@ from .. import compilation, require
 from ..compilation import jit
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..replay import shapes_alone
+from ..types import NOTHING
 from . import checkpoint, config, log
 from .budget import Budget
 from .lock import lock
@@ -83,6 +84,7 @@ class Run:
         return log.read(self.path / "metrics.csv")
 
     @property
+    @compilation.float32()
     def champion(self) -> PyTree:
         """The policy with the highest fitness of the last generation; of a learner alone, its
         actor."""
@@ -117,6 +119,7 @@ class Policy:
         return np.asarray(action)
 
 
+@compilation.float32()
 def train(
     algorithm: Any,
     *,
@@ -195,6 +198,7 @@ def train(
         )
 
 
+@compilation.float32()
 def resume(
     path: str | pathlib.Path,
     *,
@@ -349,6 +353,7 @@ def play(
     batch = []
     for i in range(int(count)):
         row = {name: column[i].item() for name, column in columns.items()}
+        row = {name: np.nan if value == NOTHING else value for name, value in row.items()}
         frames += int(row.pop("frames"))
         batch.append({"generation": generation + i + 1, "frames": frames, **row})
     return state, batch
