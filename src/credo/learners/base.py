@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from ..compilation import jit
 from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..normalization import Moments, seen
 from ..replay import Replay
 from ..types import NOTHING, Batch, Metrics
 
@@ -61,7 +62,8 @@ def learn(
     """`updates` gradient steps, each on a minibatch of its own, in one program. Their number is
     data.
 
-    **Arguments:** `signal`: what a learner optimises that names no reward itself. `key`.
+    **Arguments:** `signal`: what a learner optimises that names no reward itself. `moments`:
+    what observations are normalised by. `key`.
 
     **Returns:** the new state and the mean of each metric; NOTHING if there was no update.
     """
@@ -79,6 +81,7 @@ def _learn(
     updates: Int[Array, ""],
     *,
     signal: str,
+    moments: Moments | None = None,
     key: PRNGKeyArray,
 ) -> tuple[PyTree, Metrics]:
     dynamic, static = eqx.partition(state, eqx.is_array)
@@ -89,7 +92,8 @@ def _learn(
         rows = replay.sample(learner.batch_size, together=learner.together, key=sample_key)
         reward = rows.rewards[learner.signal or signal]
         ends = (rows.terminated, rows.truncated, rows.active)
-        batch = Batch(rows.obs, rows.action, reward, rows.next_obs, *ends)
+        obs, after = seen(moments, rows.obs), seen(moments, rows.next_obs)
+        batch = Batch(obs, rows.action, reward, after, *ends)
         state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)
         return eqx.filter(state, eqx.is_array), jax.tree.map(jnp.add, total, metrics)
 
