@@ -46,6 +46,12 @@ class Moments(eqx.Module):
         resolved = jnp.maximum(1e-4, 1e-6 * jnp.abs(self.mean))
         return jnp.sqrt(self.variance + jnp.square(resolved))
 
+    def frozen(self, policy: AbstractPolicy) -> Normalized:
+        return Normalized(policy, self.mean, self.std)
+
+    def scaled(self, obs: Float[Array, "*agents obs"]) -> Float[Array, "*agents obs"]:
+        return scaled(obs, self.mean, self.std)
+
     def after(self, experience: Experience) -> "Moments":
         """With all that was met in a rollout."""
         rows, valid = experience.transitions, experience.valid
@@ -91,14 +97,12 @@ def _merged(moments: Moments, n: Array, mean: Array, variance: Array) -> Moments
 
 def frozen(moments: Moments | None, policy: AbstractPolicy) -> AbstractPolicy:
     """A policy as it sees now, for good."""
-    return policy if moments is None else Normalized(policy, moments.mean, moments.std)
+    return policy if moments is None else moments.frozen(policy)
 
 
 def behind(moments: Moments | None, population: PyTree) -> PyTree:
     """A population that sees normalised observations."""
-    if moments is None:
-        return population
-    return eqx.filter_vmap(lambda policy: frozen(moments, policy))(population)
+    return population if moments is None else eqx.filter_vmap(moments.frozen)(population)
 
 
 def watched(moments: Moments | None, experience: Experience) -> Moments | None:
@@ -109,9 +113,7 @@ def watched(moments: Moments | None, experience: Experience) -> Moments | None:
 def seen(moments: Moments | None, obs: Array) -> Float[Array, "rows *agents obs"]:
     """Recorded observations as networks see them: float32, whatever the buffer holds."""
     obs = obs.astype(jnp.float32)
-    if moments is None:
-        return obs
-    return jax.vmap(lambda x: scaled(x, moments.mean, moments.std))(obs)
+    return obs if moments is None else jax.vmap(moments.scaled)(obs)
 
 
 def play(

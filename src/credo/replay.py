@@ -21,6 +21,7 @@ from .compilation import jit
 from .types import Transition
 
 _filled = contextvars.ContextVar("_filled", default=True)
+SMALL = 2**28  # bytes for which nobody asks whether there is room
 BLOCK = 1024  # rows that come from the host at a time: one shape, so one program
 
 
@@ -37,8 +38,8 @@ class Replay(eqx.Module):
         **Raises:** `ValueError` if that is more memory than this process may take.
         """
         require.at_least("capacity", capacity, 1)
-        size, free = row_bytes(row), _free()
-        if capacity * size > free and _filled.get():
+        size = row_bytes(row)
+        if _filled.get() and capacity * size > SMALL and capacity * size > (free := _free()):
             raise ValueError(
                 f"a replay buffer of {capacity:,} transitions needs {capacity * size:,} bytes, and "
                 f"this process may take {free:,} more: give a smaller capacity, at most "
@@ -125,7 +126,7 @@ def _extend(new: tuple[Transition, Any], replay: Replay) -> Replay:
 
 
 def row_bytes(row: Transition) -> int:
-    """Bytes one transition takes; of its largest part twice, as it is while it is read from disk."""
+    """Bytes one transition takes, and once more its largest part, as while it is read from disk."""
     sizes = [math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(row)]
     return sum(sizes) + max(sizes)
 

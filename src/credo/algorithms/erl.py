@@ -194,12 +194,10 @@ class ERL(eqx.Module):
     @float32()
     def generation(self, state: ERLState, *, key: PRNGKeyArray) -> tuple[ERLState, Metrics]:
         """One pass of the outer loop of Algorithms 6 and 10."""
-        evaluate_key, breed_key, explore_key, learn_key, allocate_key, test_key = jax.random.split(
-            key, 6
-        )
+        play_key, breed_key, explore_key, learn_key, manage_key, test_key = jax.random.split(key, 6)
         # 6-7: for actor in pop: fitness, R = Evaluate(actor, R, noise=None, ξ)
         population = behind(state.moments, state.population)
-        played, experience = collect(self.env, population, self.episodes, key=evaluate_key)
+        played, experience = collect(self.env, population, self.episodes, key=play_key)
         fitness = jnp.mean(played.of(self.signal), axis=1)
         memory = stored(self, (state.replay, state.moments), played, experience)
 
@@ -220,7 +218,7 @@ class ERL(eqx.Module):
         # 30-33: allocate the workers of the next generation.
         allocation = state.allocation
         if self.manager is not None and learners:
-            allocation = self.manager.allocate(ledger, self.workers, key=allocate_key)
+            allocation = self.manager.allocate(ledger, self.workers, key=manage_key)
 
         # 34-36: every ω generations, copy each learner's actor over the weakest.
         generation = state.generation + 1
@@ -333,7 +331,7 @@ def explore(
 ) -> tuple[Any, Ledger, tuple[Int[Array, ""], Int[Array, ""]], Metrics]:
     """Lines 16-20 of Algorithm 10: each learner's workers play an episode with noise.
 
-    **Returns:** buffer and moments, the ledger, frames and episodes played, and who played how much.
+    **Returns:** buffer and moments, the ledger, frames and episodes played, who played how much.
     """
     ledger, metrics, workers = state.ledger, {}, hybrid.workers
     frames = episodes = jnp.int32(0)
@@ -341,10 +339,8 @@ def explore(
         mine = jnp.sum((state.allocation == i).astype(jnp.int32))
         team = tree.stack(learner.explorer(state.learners[i], jnp.bool_(False)))
         team = behind(state.moments, team)
-        explore_key = jax.random.fold_in(key, i)
-        played, experience = collect(
-            hybrid.env, team, workers, wanted=mine, common=False, key=explore_key
-        )
+        own = jax.random.fold_in(key, i)
+        played, experience = collect(hybrid.env, team, workers, wanted=mine, common=False, key=own)
         memory = stored(hybrid, memory, played, experience)
         returns, theirs = played.of(hybrid.signal)[0], jnp.arange(workers) < mine
         ledger = (hybrid.manager or UCB()).observe(ledger, i, returns, theirs)
@@ -423,17 +419,13 @@ def breed(
     mutated = eqx.filter_vmap(differ)(mutants, offspring)
 
     champion = ranking(fitness)[0]
-    metrics = {"champion_maker": lineage.maker[champion]}
+    fittest, metrics = tree.take(population, champion), {"champion_maker": lineage.maker[champion]}
     fates = lineage.fates(elites, parents)
     for i in range(len(hybrid.learners)):
         metrics[f"champion_share_{i}"] = lineage.share[champion, 1 + i]
         metrics |= {f"{fate}_{i}": count[i] for fate, count in fates.items()}
-    return (
-        tree.concat(tree.take(population, elites), mutants),
-        lineage.children(elites, parents, mates, crossed, taken, mutated),
-        tree.take(population, champion),
-        metrics,
-    )
+    lineage = lineage.children(elites, parents, mates, crossed, taken, mutated)
+    return tree.concat(tree.take(population, elites), mutants), lineage, fittest, metrics
 
 
 @jit

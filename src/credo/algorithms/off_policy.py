@@ -52,8 +52,8 @@ class OffPolicy(eqx.Module):
     test_every: int = eqx.field(static=True, default=5_000)  # frames between tests
     replay_capacity: int = eqx.field(static=True, default=1_000_000)  # transitions
     normalize_observations: bool = eqx.field(static=True, default=False)
-    """Actor and critics see observations by the running mean and variance of all that was seen; the champion
-    keeps them."""
+    """Actor and critics see observations by the running mean and variance of all that was seen; the
+    champion keeps them."""
 
     def __check_init__(self):
         for name in ("episodes", "test_episodes", "test_every", "replay_capacity"):

@@ -91,8 +91,8 @@ class PPO(eqx.Module):
     test_every: int = eqx.field(static=True, default=5_000)  # frames between tests
     signal: str | None = eqx.field(static=True, default=None)  # reward; None: the task's first
     normalize_observations: bool = eqx.field(static=True, default=False)
-    """Actor and critic see observations by the running mean and variance of all that was seen; the champion
-    keeps them."""
+    """Actor and critic see observations by the running mean and variance of all that was seen; the
+    champion keeps them."""
 
     def __check_init__(self):
         require.fits(self.env, self.network, self)

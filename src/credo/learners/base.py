@@ -109,11 +109,7 @@ def averaged(total: Metrics, count: Int[Array, ""]) -> Metrics:
 
 
 def adam(
-    weights: PyTree,
-    gradient: PyTree,
-    state: optax.OptState,
-    rate: Float[Array, ""] | float,
-    max_norm: float | None = None,
+    weights: PyTree, gradient: PyTree, state: optax.OptState, rate: Any, max_norm: Any = None
 ) -> tuple[PyTree, optax.OptState]:
     """One step of Adam (Kingma & Ba 2015) down the gradient, clipped to a global norm."""
     # Optax multiplies counters by floats, which strict promotion of dtypes would refuse.
