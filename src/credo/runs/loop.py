@@ -30,6 +30,7 @@ from ..compilation import jit
 from ..environments import processes
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..replay import Replay, shapes_alone
+from ..types import NOTHING
 from . import checkpoint, config, files, log, policy, record, screen, weights
 from .budget import Budget, fitted
 from .folder import free_name, new_folder
@@ -90,6 +91,7 @@ class Run:
         return log.read(self.path / "metrics.csv")
 
     @property
+    @compilation.float32()
     def champion(self) -> PyTree:
         """The policy with the highest fitness of the last generation; of a learner alone, its
         actor. Raises `RunError` if it is another run's, or if the task has other sizes today."""
@@ -109,6 +111,7 @@ class Run:
 
 
 @screen.calm()
+@compilation.float32()
 def train(
     algorithm: Any,
     *,
@@ -193,6 +196,7 @@ def train(
 
 
 @screen.calm()
+@compilation.float32()
 def resume(
     path: str | pathlib.Path,
     *,
@@ -477,6 +481,7 @@ def play(
     batch = []
     for i in range(int(count)):
         row = {name: column[i].item() for name, column in columns.items()}
+        row = {name: np.nan if value == NOTHING else value for name, value in row.items()}
         frames += int(row.pop("frames"))
         batch.append({"generation": generation + i + 1, "frames": frames, **row})
     return state, batch
