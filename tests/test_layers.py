@@ -7,9 +7,10 @@ import credo
 
 ROOT = pathlib.Path(credo.__file__).parent
 LEVELS = [
-    {"types", "tree", "compilation", "require", "runner"},
+    {"types", "tree", "compilation", "require", "memory", "runner"},
     {"environments", "networks"},
     {"rollout", "replay"},
+    {"normalization"},
     {"evolution", "learners"},
     {"algorithms"},
     {"analysis"},

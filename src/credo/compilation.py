@@ -1,9 +1,10 @@
 """Compiling: one `jit` for the whole library, and a cache that outlives the process."""
 
+import contextlib
 import functools
 import os
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -42,6 +43,18 @@ def jit(function: Any = None, *, donate: Any = "none") -> Any:
         return (inner if traced else outer)(*args, **kwargs)
 
     return call
+
+
+@contextlib.contextmanager
+def float32() -> Iterator[None]:
+    """Numbers have 32 bits here, also where JAX was told to give them 64 (`JAX_ENABLE_X64`), which
+    is the caller's affair: a run is the same with and without. Wider ones that are passed to a
+    program are rounded. Also a decorator, `@float32()`; other threads see nothing of it.
+
+    What a task in JAX computes between `reset` and the end of an episode has 32 bits too.
+    """
+    with jax.enable_x64(False) if jax.config.jax_enable_x64 else contextlib.nullcontext():
+        yield
 
 
 def when(due: Any, play: Callable[[], Any], skip: Callable[[], Any]) -> Any:

@@ -6,7 +6,7 @@ writes donates it: extending 1 GB in place takes milliseconds, copying it half a
 
 import contextlib
 import contextvars
-import os
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,11 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
-from . import require
+from . import memory, require
 from .compilation import jit
 from .types import Transition
 
 _filled = contextvars.ContextVar("_filled", default=True)
+SMALL = 2**28  # bytes for which nobody asks whether there is room
 BLOCK = 1024  # rows that come from the host at a time: one shape, so one program
 
 
@@ -34,15 +35,15 @@ class Replay(eqx.Module):
     def empty(cls, row: Transition, capacity: int) -> "Replay":
         """Room for `capacity` rows like `row`.
 
-        **Raises:** `ValueError` if that is more than the memory of this machine.
+        **Raises:** `ValueError` if that is more memory than this process may take.
         """
         require.at_least("capacity", capacity, 1)
-        needed, free = capacity * row_bytes(row), _memory()
-        if needed > free and _filled.get():
+        size = row_bytes(row)
+        if _filled.get() and capacity * size > SMALL and capacity * size > (free := _free()):
             raise ValueError(
-                f"a replay buffer of {capacity:,} transitions needs {needed / 1e9:.1f} GB and this "
-                f"machine has {free / 1e9:.1f} GB: give a smaller capacity, at most "
-                f"{int(free // row_bytes(row)):,}"
+                f"a replay buffer of {capacity:,} transitions needs {capacity * size:,} bytes, and "
+                f"this process may take {free:,} more: give a smaller capacity, at most "
+                f"{free // size:,}; runs at the same time (--seeds) share them"
             )
         zeros = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), row)
         return cls(zeros, jnp.int32(0))
@@ -125,12 +126,12 @@ def _extend(new: tuple[Transition, Any], replay: Replay) -> Replay:
 
 
 def row_bytes(row: Transition) -> int:
-    """Bytes one transition takes."""
-    return sum(int(np.prod(x.shape)) * x.dtype.itemsize for x in jax.tree.leaves(row))
+    """Bytes one transition takes, and once more its largest part, as while it is read from disk."""
+    sizes = [math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(row)]
+    return sum(sizes) + max(sizes)
 
 
-def _memory() -> int:
-    """Bytes the device has, as far as it says."""
-    device = jax.devices()[0]
-    limit = (device.memory_stats() or {}).get("bytes_limit")
-    return limit or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+def _free() -> int:
+    """Bytes of the device, if it has memory of its own; else what this process may still take."""
+    own = jax.devices()[0].memory_stats() or {}
+    return own["bytes_limit"] if "bytes_limit" in own else memory.available()

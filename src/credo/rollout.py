@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from . import tree
-from .compilation import jit
+from .compilation import float32, jit
 from .environments.base import AbstractEnvironment, AbstractSequenceTask, correct
 from .environments.host import AbstractHostEnvironment, Episodes
 from .networks.base import AbstractPolicy
@@ -43,6 +43,7 @@ class Experience(eqx.Module):
         return eqx.tree_at(lambda e: e.transitions.rewards, self, rewards)
 
 
+@float32()
 def evaluate(
     env: Environment, population: PyTree, episodes: int, *, common: bool = True, key: PRNGKeyArray
 ) -> Evaluation:
@@ -60,6 +61,7 @@ def evaluate(
     return play(env, lanes, jnp.int32(episodes), False)[0]
 
 
+@float32()
 def collect(
     env: Environment,
     population: PyTree,

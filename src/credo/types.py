@@ -2,9 +2,13 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 Metrics = dict[str, Array]  # one scalar per name
+NOTHING = float(np.finfo(np.float32).min)
+"""A metric that says nothing in this generation; `metrics.csv` has NaN there. Inside JAX a NaN of
+Credo's own would stop whoever looks for theirs with `jax_debug_nans`."""
 
 
 class TimeStep(eqx.Module):

@@ -52,14 +52,14 @@ def test_fitness_is_the_mean_or_best_over_the_teams_of_a_member():
     members = jnp.array([[0, 0, 1, 1, 3], [2, 0, 2, 2, 2]])
     returns = jnp.array([[1.0, 3.0], [4.0, 4.0], [0.0, 0.0], [8.0, 6.0], [5.0, 5.0]])
     ccea = CCEA(Meet(), population_size=4, elite_fraction=0.25)
-    nan = np.nan
+    none = -np.inf  # it ranks last
     np.testing.assert_allclose(
         assigned(ccea, members, returns),
-        [[3.0, 3.5, nan, 5.0], [4.0, nan, (2 + 0 + 7 + 5) / 4, nan]],
+        [[3.0, 3.5, none, 5.0], [4.0, none, (2 + 0 + 7 + 5) / 4, none]],
     )
     best = CCEA(Meet(), population_size=4, elite_fraction=0.25, assignment="best")
     np.testing.assert_allclose(
-        assigned(best, members, returns), [[4.0, 7.0, nan, 5.0], [4.0, nan, 7.0, nan]]
+        assigned(best, members, returns), [[4.0, 7.0, none, 5.0], [4.0, none, 7.0, none]]
     )
 
 
@@ -67,7 +67,7 @@ def test_of_a_private_signal_each_member_is_assigned_its_own():
     members = jnp.array([[0, 1], [1, 1]])
     returns = jnp.array([[[1.0, 10.0]], [[2.0, 30.0]]])  # [teams, episodes, agents]
     ccea = CCEA(Meet(), population_size=2, elite_fraction=0.5)
-    np.testing.assert_allclose(assigned(ccea, members, returns), [[1.0, 2.0], [np.nan, 20.0]])
+    np.testing.assert_allclose(assigned(ccea, members, returns), [[1.0, 2.0], [-np.inf, 20.0]])
 
 
 def test_a_generation_keeps_the_elite_of_each_population_and_joins_them():

@@ -29,7 +29,7 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .. import require, tree
-from ..compilation import jit
+from ..compilation import float32, jit
 from ..environments.base import AbstractSequenceTask
 from ..learners.base import adam, adam_state
 from ..networks.base import AbstractNetwork, AbstractPolicy
@@ -121,11 +121,13 @@ class BPTT(eqx.Module):
         """Settings by name, for the command line."""
         return {"as-written": cls.as_written, "as-coded": cls.as_coded, "ours": cls.ours}
 
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> BPTTState:
         network_key, examples_key = jax.random.split(key)
         champion = self.network.init(*self.env.sizes, key=network_key)
         return BPTTState(champion, adam_state(champion), jnp.int32(0), examples_key)
 
+    @float32()
     def generation(self, state: BPTTState, *, key: PRNGKeyArray) -> tuple[BPTTState, Metrics]:
         """`updates` steps of Adam, and a test of the network on fresh sequences."""
         learn_key, test_key = jax.random.split(key)

@@ -29,15 +29,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
-from ..compilation import jit
+from ..compilation import float32, jit
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.extinction import Extinction
 from ..evolution.islands import Islands
 from ..evolution.mutation import AbstractMutation, MatrixMutation
 from ..evolution.selection import AbstractSelection, Tournament, rankable
-from ..networks.base import AbstractNetwork
+from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.mlp import MLP
 from ..networks.team import Team, TeamPolicy
+from ..normalization import Moments, behind, frozen, play
 from ..rollout import Environment, evaluate
 from ..types import Metrics
 from .neuroevolution import breed
@@ -45,7 +46,8 @@ from .neuroevolution import breed
 
 class CCEAState(eqx.Module):
     populations: PyTree  # leaves [M, k, ...]; bred, not yet evaluated
-    champion: TeamPolicy  # the best of each population, together
+    champion: AbstractPolicy  # the best of each population, together
+    moments: Moments | None  # of what was seen; None: observations are as they are
 
 
 class CCEA(eqx.Module):
@@ -73,6 +75,9 @@ class CCEA(eqx.Module):
     """Of each population. Every island then has its share of the elites, its own tournaments, mates
     and events of extinction."""
     fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
+    normalize_observations: bool = eqx.field(static=True, default=False)
+    """All populations see observations by the running mean and variance of all that was seen; the
+    champion keeps them. A generation's observations are recorded for it."""
 
     def __check_init__(self):
         if self.network.team:
@@ -135,13 +140,17 @@ class CCEA(eqx.Module):
             jax.random.split(key, self.population_size if size is None else size)
         )
 
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> CCEAState:
         # 1: Initialize M populations of k neural network policies.
         keys = jax.random.split(key, self.agents)
         populations = eqx.filter_vmap(lambda key: self.new_population(key=key))(keys)
         first = jnp.zeros((self.agents, 1), jnp.int32)
-        return CCEAState(populations, tree.take(drafted(self, populations, first), 0))
+        moments = Moments.first(self.env) if self.normalize_observations else None
+        champion = frozen(moments, tree.take(drafted(self, populations, first), 0))
+        return CCEAState(populations, champion, moments)
 
+    @float32()
     def generation(self, state: CCEAState, *, key: PRNGKeyArray) -> tuple[CCEAState, Metrics]:
         """Lines 4-21 of Algorithm 4, and the test of the champion team."""
         team_key, play_key, breed_key, test_key = jax.random.split(key, 4)
@@ -150,11 +159,11 @@ class CCEA(eqx.Module):
         members = self.drawn(key=team_key)
         teams = drafted(self, state.populations, members)
         # 7-8: run z independent simulations for team T_i; assign reward to each of its members.
-        played = evaluate(self.env, teams, self.simulations, key=play_key)
+        played, moments = play(self.env, teams, self.simulations, state.moments, key=play_key)
         fitness = assigned(self, members, played.returns[self.signal])
         # 9-21: for each population: rank, keep the elites, select, mutate; now and then extinction.
         best = jnp.argmax(rankable(fitness), axis=1)
-        champion = drafted(self, state.populations, best[:, None])
+        champion = behind(state.moments, drafted(self, state.populations, best[:, None]))
         populations = bred(self, state.populations, fitness, key=breed_key)
 
         test = evaluate(self.env, champion, self.test_episodes, key=test_key)
@@ -166,7 +175,7 @@ class CCEA(eqx.Module):
             "champion_score": jnp.mean(test.of(self.env.reported)),
             "frames": jnp.sum(played.steps),
         }
-        return CCEAState(populations, tree.take(champion, 0)), metrics
+        return CCEAState(populations, tree.take(champion, 0), moments), metrics
 
     def drawn(self, *, key: PRNGKeyArray) -> Int[Array, "agents teams"]:
         """Who is in which team."""
@@ -216,7 +225,7 @@ def assigned(
     members: Int[Array, "agents teams"],
     returns: Float[Array, "teams episodes *agents"],
 ) -> Float[Array, "agents k"]:
-    """Fitness of every individual, from the teams that it was in; NaN if there was none.
+    """Fitness of every individual, from the teams that it was in; -inf if there was none.
 
     **Arguments:** `members[i, t]`: who of population i is in team t. `returns` of a private signal
     have an axis of agents.
@@ -227,5 +236,7 @@ def assigned(
     mine = members[:, None, :] == jnp.arange(k)[None, :, None]  # [agents, k, teams]
     if ccea.assignment == "best":
         best = jnp.max(jnp.where(mine, rankable(reward)[:, None], -jnp.inf), axis=2)
-        return jnp.where(jnp.any(mine, axis=2), best, jnp.nan)
-    return jnp.mean(jnp.broadcast_to(reward[:, None], mine.shape), axis=2, where=mine)
+    else:
+        every = jnp.broadcast_to(reward[:, None], mine.shape)
+        best = jnp.mean(every, axis=2, where=mine)
+    return jnp.where(jnp.any(mine, axis=2), best, -jnp.inf)

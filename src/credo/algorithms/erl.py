@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, rollout, tree
-from ..compilation import jit, when
+from ..compilation import float32, jit, when
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.lineage import Lineage
 from ..evolution.mutation import AbstractMutation, MatrixMutation
@@ -42,6 +42,7 @@ from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, ddpg
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.mlp import MLP, Critic
 from ..networks.team import Team
+from ..normalization import Moments, behind, frozen, warmed, watched
 from ..replay import Replay, extend
 from ..rollout import Environment, Experience, blank, collect
 from ..types import Evaluation, Metrics
@@ -71,6 +72,7 @@ class ERLState(eqx.Module):
     frames: Int[Array, ""]
     episodes: Int[Array, ""]
     generation: Int[Array, ""]
+    moments: Moments | None  # of what was seen; None: observations are as they are
 
 
 class ERL(eqx.Module):
@@ -101,6 +103,9 @@ class ERL(eqx.Module):
     test_episodes: int = eqx.field(static=True, default=5)  # of the champion; not counted
     test_every: int = eqx.field(static=True, default=1)  # generations between tests
     fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
+    normalize_observations: bool = eqx.field(static=True, default=False)
+    """Policies see observations by the running mean and variance of all that was seen; the champion
+    keeps them."""
 
     def __check_init__(self):
         for name, least in (("population_size", 2), ("episodes", 1), ("workers", 1)):
@@ -174,21 +179,27 @@ class ERL(eqx.Module):
         """e = int(ψ·k)"""
         return int(self.elite_fraction * self.population_size)
 
+    @property
+    def most_frames(self) -> int:
+        """Frames of one generation, at most."""
+        return most_frames(self)
+
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> ERLState:
         return begin(self, key=key)
 
     def warm(self, state: ERLState, policy: AbstractPolicy) -> ERLState:
         return warm(self, state, policy)
 
+    @float32()
     def generation(self, state: ERLState, *, key: PRNGKeyArray) -> tuple[ERLState, Metrics]:
         """One pass of the outer loop of Algorithms 6 and 10."""
-        evaluate_key, breed_key, explore_key, learn_key, allocate_key, test_key = jax.random.split(
-            key, 6
-        )
+        play_key, breed_key, explore_key, learn_key, manage_key, test_key = jax.random.split(key, 6)
         # 6-7: for actor in pop: fitness, R = Evaluate(actor, R, noise=None, ξ)
-        played, experience = collect(self.env, state.population, self.episodes, key=evaluate_key)
+        population = behind(state.moments, state.population)
+        played, experience = collect(self.env, population, self.episodes, key=play_key)
         fitness = jnp.mean(played.of(self.signal), axis=1)
-        replay = stored(self, state.replay, played, experience) if self.learners else None
+        memory = stored(self, (state.replay, state.moments), played, experience)
 
         # 8-15: rank, keep the elites, select, cross and mutate.
         lineage, standing = state.lineage, fitness
@@ -198,16 +209,16 @@ class ERL(eqx.Module):
             self, state.population, lineage, standing, key=breed_key
         )
         # 16-20: learners play too, with noise; what they earn is their value.
-        replay, ledger, counts, explored = explore(self, state, replay, key=explore_key)
+        memory, ledger, counts, explored = explore(self, state, memory, key=explore_key)
         frames, episodes = jnp.sum(played.steps) + counts[0], played.steps.size + counts[1]
 
         # 21-29: as many updates as frames, each learner on minibatches of its own.
-        learners, learned = improve(self, state, replay, frames, key=learn_key)
+        learners, learned = improve(self, state, memory, frames, key=learn_key)
 
         # 30-33: allocate the workers of the next generation.
         allocation = state.allocation
         if self.manager is not None and learners:
-            allocation = self.manager.allocate(ledger, self.workers, key=allocate_key)
+            allocation = self.manager.allocate(ledger, self.workers, key=manage_key)
 
         # 34-36: every ω generations, copy each learner's actor over the weakest.
         generation = state.generation + 1
@@ -215,8 +226,9 @@ class ERL(eqx.Module):
         actors = [learner.actor(s) for learner, s in zip(self.learners, learners, strict=True)]
         population, lineage = inject(population, lineage, actors, sync)
 
-        after = (population, lineage, learners, replay, ledger, allocation, fittest, state.score)
-        counted = (state.frames + frames, state.episodes + episodes, generation)
+        fittest = frozen(state.moments, fittest)
+        after = (population, lineage, learners, memory[0], ledger, allocation, fittest, state.score)
+        counted = (state.frames + frames, state.episodes + episodes, generation, memory[1])
         metrics = {"frames": frames} | bred | explored | learned
         return tested(self, ERLState(*after, *counted), fitness, metrics, key=test_key)
 
@@ -242,6 +254,7 @@ class Hybrid(Protocol):
     updates_per_frame: Any
     warmup_frames: Any
     replay_capacity: Any
+    normalize_observations: Any
     test_episodes: Any
     test_every: Any
 
@@ -265,6 +278,7 @@ def begin(hybrid: Hybrid, *, key: PRNGKeyArray) -> ERLState:
     population = eqx.filter_vmap(lambda key: network.init(*env.sizes, key=key))(
         jax.random.split(population_key, k)
     )
+    moments = Moments.first(env) if hybrid.normalize_observations else None
     return ERLState(
         population,
         Lineage.first(k, q),
@@ -272,53 +286,71 @@ def begin(hybrid: Hybrid, *, key: PRNGKeyArray) -> ERLState:
         Replay.empty(blank(env), hybrid.replay_capacity) if learners else None,
         Ledger.empty(q),
         even(hybrid.workers, max(q, 1)),
-        tree.take(population, 0),
-        jnp.float32(jnp.nan),
+        frozen(moments, tree.take(population, 0)),
+        jnp.float32(-jnp.inf),  # never tested
         *(jnp.int32(0) for _ in range(3)),
+        moments,
     )
 
 
+def most_frames(hybrid: Any) -> int:
+    """Frames of one generation, if every episode lasts until the clock ends it."""
+    played = hybrid.population_size * hybrid.episodes
+    return (played + (hybrid.workers if hybrid.learners else 0)) * hybrid.env.max_steps
+
+
 def warm(hybrid: Hybrid, state: ERLState, policy: AbstractPolicy) -> ERLState:
-    """`state` that goes on from a saved policy: the first member, and every learner."""
+    """`state` that goes on from a saved policy: the first member, and every learner; all see by its
+    statistics."""
+    policy, moments = warmed(policy, state.moments)
     learners = tuple(
         learner.warm(s, policy) for learner, s in zip(hybrid.learners, state.learners, strict=True)
     )
     population = tree.put(state.population, 0, policy)
-    return eqx.tree_at(lambda s: (s.population, s.learners), state, (population, learners))
+    parts = (population, learners, moments, frozen(moments, policy))
+    return eqx.tree_at(
+        lambda s: (s.population, s.learners, s.moments, s.champion), state, parts, is_leaf=none
+    )
 
 
-def stored(hybrid: Hybrid, replay: Any, played: Evaluation, experience: Experience) -> Any:
-    """The buffer with what was played."""
+def none(x: Any) -> bool:
+    return x is None
+
+
+def stored(hybrid: Hybrid, memory: Any, played: Evaluation, experience: Experience) -> Any:
+    """The buffer, and the moments of observations, with what was played."""
+    replay, moments = memory[0], watched(memory[1], experience)
     experience = experience.spread(played) if hybrid.redistribute else experience
-    return extend(replay, experience.transitions, experience.valid)
+    if hybrid.learners:
+        replay = extend(replay, experience.transitions, experience.valid)
+    return replay, moments
 
 
 def explore(
-    hybrid: Hybrid, state: ERLState, replay: Any, *, key: PRNGKeyArray
+    hybrid: Hybrid, state: ERLState, memory: Any, *, key: PRNGKeyArray
 ) -> tuple[Any, Ledger, tuple[Int[Array, ""], Int[Array, ""]], Metrics]:
     """Lines 16-20 of Algorithm 10: each learner's workers play an episode with noise.
 
-    **Returns:** the buffer, the ledger, frames and episodes played, and who played how much.
+    **Returns:** buffer and moments, the ledger, frames and episodes played, who played how much.
     """
     ledger, metrics, workers = state.ledger, {}, hybrid.workers
     frames = episodes = jnp.int32(0)
     for i, learner in enumerate(hybrid.learners):
         mine = jnp.sum((state.allocation == i).astype(jnp.int32))
         team = tree.stack(learner.explorer(state.learners[i], jnp.bool_(False)))
-        explore_key = jax.random.fold_in(key, i)
-        played, experience = collect(
-            hybrid.env, team, workers, wanted=mine, common=False, key=explore_key
-        )
-        replay = stored(hybrid, replay, played, experience)
+        team = behind(state.moments, team)
+        own = jax.random.fold_in(key, i)
+        played, experience = collect(hybrid.env, team, workers, wanted=mine, common=False, key=own)
+        memory = stored(hybrid, memory, played, experience)
         returns, theirs = played.of(hybrid.signal)[0], jnp.arange(workers) < mine
         ledger = (hybrid.manager or UCB()).observe(ledger, i, returns, theirs)
         frames, episodes = frames + jnp.sum(played.steps), episodes + mine
         metrics |= {f"workers_{i}": mine, f"value_{i}": ledger.value[i]}
-    return replay, ledger, (frames, episodes), metrics
+    return memory, ledger, (frames, episodes), metrics
 
 
 def improve(
-    hybrid: Hybrid, state: ERLState, replay: Any, frames: Int[Array, ""], *, key: PRNGKeyArray
+    hybrid: Hybrid, state: ERLState, memory: Any, frames: Int[Array, ""], *, key: PRNGKeyArray
 ) -> tuple[tuple[PyTree, ...], Metrics]:
     """Lines 21-29 of Algorithm 10: each learner makes `updates_per_frame` steps for each of
     `frames` on the common buffer."""
@@ -328,9 +360,8 @@ def improve(
     learned, metrics = [], {"updates": updates}
     for i, learner in enumerate(hybrid.learners):
         step_key = jax.random.fold_in(key, i)
-        after, report = learn(
-            learner, state.learners[i], replay, updates, signal=hybrid.signal, key=step_key
-        )
+        given = {"signal": hybrid.signal, "moments": memory[1], "key": step_key}
+        after, report = learn(learner, state.learners[i], memory[0], updates, **given)
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}
     return tuple(learned), metrics
@@ -388,17 +419,13 @@ def breed(
     mutated = eqx.filter_vmap(differ)(mutants, offspring)
 
     champion = ranking(fitness)[0]
-    metrics = {"champion_maker": lineage.maker[champion]}
+    fittest, metrics = tree.take(population, champion), {"champion_maker": lineage.maker[champion]}
     fates = lineage.fates(elites, parents)
     for i in range(len(hybrid.learners)):
         metrics[f"champion_share_{i}"] = lineage.share[champion, 1 + i]
         metrics |= {f"{fate}_{i}": count[i] for fate, count in fates.items()}
-    return (
-        tree.concat(tree.take(population, elites), mutants),
-        lineage.children(elites, parents, mates, crossed, taken, mutated),
-        tree.take(population, champion),
-        metrics,
-    )
+    lineage = lineage.children(elites, parents, mates, crossed, taken, mutated)
+    return tree.concat(tree.take(population, elites), mutants), lineage, fittest, metrics
 
 
 @jit

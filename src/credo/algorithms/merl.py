@@ -32,6 +32,7 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
 from .. import require
+from ..compilation import float32
 from ..evolution.crossover import AbstractCrossover, MaskedCrossover
 from ..evolution.mutation import AbstractMutation
 from ..evolution.selection import AbstractSelection, Tournament
@@ -39,6 +40,7 @@ from ..learners.base import AbstractLearner
 from ..learners.td3 import TD3, TEAM
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.team import Team
+from ..normalization import behind, frozen
 from ..rollout import Environment, collect
 from ..types import Metrics
 from .erl import (
@@ -49,6 +51,7 @@ from .erl import (
     explore,
     improve,
     inject,
+    most_frames,
     stored,
     tested,
     warm,
@@ -82,6 +85,7 @@ class MERL(eqx.Module):
     test_every: int = eqx.field(static=True, default=1)  # generations between tests
     fitness: str | None = eqx.field(static=True, default=None)  # signal; None: what is reported
     redistribute: bool = eqx.field(static=True, default=False)  # as in ERL
+    normalize_observations: bool = eqx.field(static=True, default=False)  # as in ERL
 
     def __check_init__(self):
         for name, least in (("population_size", 2), ("episodes", 1), ("workers", 1)):
@@ -118,6 +122,12 @@ class MERL(eqx.Module):
         """The reward that evolution maximises."""
         return self.fitness or self.env.reported
 
+    @property
+    def most_frames(self) -> int:
+        """Frames of one generation, at most."""
+        return most_frames(self)
+
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> ERLState:
         # 1-4: a population of k multi-head teams; learners with a shared critic; replay buffers.
         return begin(self, key=key)
@@ -125,26 +135,28 @@ class MERL(eqx.Module):
     def warm(self, state: ERLState, policy: AbstractPolicy) -> ERLState:
         return warm(self, state, policy)
 
+    @float32()
     def generation(self, state: ERLState, *, key: PRNGKeyArray) -> tuple[ERLState, Metrics]:
         """One pass of the outer loop of Algorithm 13."""
         rollout_key, breed_key, explore_key, learn_key, test_key = jax.random.split(key, 5)
 
         # 6-9: for team π: g, R = Rollout(π, R, noise=None, ξ); g is π's fitness.
-        played, experience = collect(self.env, state.population, self.episodes, key=rollout_key)
+        population = behind(state.moments, state.population)
+        played, experience = collect(self.env, population, self.episodes, key=rollout_key)
         fitness = jnp.mean(played.of(self.signal), axis=1)
-        replay = stored(self, state.replay, played, experience) if self.learners else None
+        memory = stored(self, (state.replay, state.moments), played, experience)
 
         # 10-14: rank, keep e elites, select k-e by tournament, cross with elites; and mutate.
         population, lineage, champion, bred = breed(
             self, state.population, state.lineage, fitness, key=breed_key
         )
         # 8: Rollout(π_pg, R, noise=W_g, ξ=1), in parallel worlds.
-        replay, ledger, counts, explored = explore(self, state, replay, key=explore_key)
+        memory, ledger, counts, explored = explore(self, state, memory, key=explore_key)
         frames, episodes = jnp.sum(played.steps) + counts[0], played.steps.size + counts[1]
 
         # 15-21: for agent k: a minibatch from R^k; descend the critic's loss; follow the gradient
         # of Q with head k; move the targets.
-        learners, learned = improve(self, state, replay, frames, key=learn_key)
+        learners, learned = improve(self, state, memory, frames, key=learn_key)
 
         # 22: Migrate: the weakest teams become copies of π_pg.
         generation = state.generation + 1
@@ -152,8 +164,9 @@ class MERL(eqx.Module):
         migrants = [learner.actor(s) for learner, s in zip(self.learners, learners, strict=True)]
         population, lineage = inject(population, lineage, migrants, due)
 
-        after = (population, lineage, learners, replay, ledger, state.allocation, champion)
-        counted = (state.frames + frames, state.episodes + episodes, generation)
+        champion = frozen(state.moments, champion)
+        after = (population, lineage, learners, memory[0], ledger, state.allocation, champion)
+        counted = (state.frames + frames, state.episodes + episodes, generation, memory[1])
         metrics = {"frames": frames} | bred | explored | learned
         state = ERLState(*after, state.score, *counted)
         return tested(self, state, fitness, metrics, key=test_key)

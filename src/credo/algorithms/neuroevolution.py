@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
-from ..compilation import jit
+from ..compilation import float32, jit
 from ..environments.base import AbstractSequenceTask
 from ..environments.sequence_classification import SequenceClassification
 from ..evolution.agents import AgentCrossover
@@ -36,6 +36,7 @@ from ..networks.base import AbstractNetwork
 from ..networks.dmmu import DMMU
 from ..networks.mmu import MMU
 from ..networks.team import Team
+from ..normalization import Moments, behind, frozen, play
 from ..rollout import Environment, evaluate
 from ..types import Evaluation, Metrics
 
@@ -62,6 +63,7 @@ class NeuroevolutionState(eqx.Module):
     record: Float[Array, " pop"]  # running mean of a member's fitness in earlier generations
     age: Int[Array, " pop"]  # how many generations that mean counts for; 0: bred just now
     level: Int[Array, ""]  # of the curriculum
+    moments: Moments | None  # of what was seen; None: observations are as they are
 
 
 class Neuroevolution(eqx.Module):
@@ -91,6 +93,9 @@ class Neuroevolution(eqx.Module):
     fitness: tuple[str, ...] = eqx.field(static=True, default=(), converter=_names)
     """Reward signals whose sum is the fitness; none: the task's first."""
     score: str | None = eqx.field(static=True, default=None)  # signal; None: the task's last
+    normalize_observations: bool = eqx.field(static=True, default=False)
+    """The population sees observations by the running mean and variance of all that was seen; the
+    champion keeps them. A generation's observations are recorded for it."""
 
     def __check_init__(self):
         for name, minimum in (
@@ -185,15 +190,18 @@ class Neuroevolution(eqx.Module):
             jax.random.split(key, self.population_size if size is None else size)
         )
 
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> NeuroevolutionState:
         # 1: Initialize a population of k neural networks.
         population = self.new_population(key=key)
         k = self.population_size
         level = jnp.int32(self.curriculum.start if self.curriculum else 0)
-        return NeuroevolutionState(
-            population, tree.take(population, 0), jnp.zeros(k), jnp.zeros(k, jnp.int32), level
-        )
+        moments = Moments.first(self.env) if self.normalize_observations else None
+        champion = frozen(moments, tree.take(population, 0))
+        record, age = jnp.zeros(k), jnp.zeros(k, jnp.int32)
+        return NeuroevolutionState(population, champion, record, age, level, moments)
 
+    @float32()
     def generation(
         self, state: NeuroevolutionState, *, key: PRNGKeyArray
     ) -> tuple[NeuroevolutionState, Metrics]:
@@ -203,7 +211,7 @@ class Neuroevolution(eqx.Module):
         env = self.curriculum.task(self.env, state.level) if self.curriculum else self.env
 
         # 4-5: for each network, compute fitness.
-        evaluation = evaluate(env, population, self.episodes, key=evaluate_key)
+        evaluation, moments = play(env, population, self.episodes, state.moments, key=evaluate_key)
         fitness, returns = assess(self, state, evaluation)
 
         # 6-12: rank; keep the elites; select, and mutate the selected.
@@ -212,7 +220,7 @@ class Neuroevolution(eqx.Module):
         record, age = remember(self, state, fitness, order)
 
         # The network with the highest fitness is tested on fresh episodes of the whole task.
-        champion = tree.take(population, order[:1])
+        champion = behind(state.moments, tree.take(population, order[:1]))
         test = evaluate(self.env, champion, self.test_episodes, key=test_key)
         score = self.score or self.env.reported
         metrics = {
@@ -226,7 +234,8 @@ class Neuroevolution(eqx.Module):
         if self.curriculum:
             metrics["level"] = level
             level = self.curriculum.next(level, jnp.mean(evaluation.of(score)[order[0]]))
-        return NeuroevolutionState(bred, tree.take(champion, 0), record, age, level), metrics
+        champion = tree.take(champion, 0)
+        return NeuroevolutionState(bred, champion, record, age, level, moments), metrics
 
 
 @jit

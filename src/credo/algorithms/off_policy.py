@@ -14,12 +14,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, rollout, tree
-from ..compilation import when
+from ..compilation import float32, when
 from ..learners.base import AbstractLearner, learn
 from ..learners.sac import SAC
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, TEAM, ddpg, maddpg, matd3
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.team import Team
+from ..normalization import Moments, behind, frozen, warmed, watched
 from ..replay import Replay, extend
 from ..rollout import Environment, blank, collect
 from ..types import Metrics
@@ -31,6 +32,7 @@ class OffPolicyState(eqx.Module):
     champion: AbstractPolicy  # the actor
     score: Float[Array, ""]  # of its last test
     frames: Int[Array, ""]
+    moments: Moments | None  # of what was seen; None: observations are as they are
 
 
 class OffPolicy(eqx.Module):
@@ -49,6 +51,9 @@ class OffPolicy(eqx.Module):
     test_episodes: int = eqx.field(static=True, default=10)  # without noise; not counted
     test_every: int = eqx.field(static=True, default=5_000)  # frames between tests
     replay_capacity: int = eqx.field(static=True, default=1_000_000)  # transitions
+    normalize_observations: bool = eqx.field(static=True, default=False)
+    """Actor and critics see observations by the running mean and variance of all that was seen; the
+    champion keeps them."""
 
     def __check_init__(self):
         for name in ("episodes", "test_episodes", "test_every", "replay_capacity"):
@@ -96,21 +101,31 @@ class OffPolicy(eqx.Module):
         names = ("td3", "ddpg", "sac", "matd3", "maddpg")
         return {name: getattr(cls, name) for name in names}
 
+    @property
+    def most_frames(self) -> int:
+        """Frames of one generation, at most."""
+        return self.episodes * self.env.max_steps
+
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> OffPolicyState:
         env = self.env
         require.continuous(env, self.learner)
         learner = self.learner.init(self.network, *env.sizes, key=key)
         replay = Replay.empty(blank(env), self.replay_capacity)
-        actor = self.learner.actor(learner)
-        return OffPolicyState(learner, replay, actor, jnp.float32(jnp.nan), jnp.int32(0))
+        moments = Moments.first(env) if self.normalize_observations else None
+        actor = frozen(moments, self.learner.actor(learner))
+        counted = (jnp.float32(-jnp.inf), jnp.int32(0), moments)
+        return OffPolicyState(learner, replay, actor, *counted)
 
     def warm(self, state: OffPolicyState, policy: AbstractPolicy) -> OffPolicyState:
         """`state` that goes on from a saved policy of the same network, without random actions. Its
         critics are new."""
-        learner = self.learner.warm(state.learner, policy)
+        actor, moments = warmed(policy, state.moments)
+        learner = self.learner.warm(state.learner, actor)
         frames = jnp.int32(self.start_frames)
-        return OffPolicyState(learner, state.replay, policy, state.score, frames)
+        return OffPolicyState(learner, state.replay, policy, state.score, frames, moments)
 
+    @float32()
     def generation(
         self, state: OffPolicyState, *, key: PRNGKeyArray
     ) -> tuple[OffPolicyState, Metrics]:
@@ -118,9 +133,11 @@ class OffPolicy(eqx.Module):
 
         # Act with noise (at first at random), and remember every transition.
         explorer = self.learner.explorer(state.learner, state.frames < self.start_frames)
+        explorers = behind(state.moments, tree.stack(explorer))
         played, experience = collect(
-            self.env, tree.stack(explorer), self.episodes, common=False, key=explore_key
+            self.env, explorers, self.episodes, common=False, key=explore_key
         )
+        moments = watched(state.moments, experience)
         experience = experience.spread(played) if self.redistribute else experience
         replay = extend(state.replay, experience.transitions, experience.valid)
         new = jnp.sum(played.steps)
@@ -131,13 +148,13 @@ class OffPolicy(eqx.Module):
         before = jnp.floor(state.frames.astype(jnp.float32) * self.updates_per_frame)
         updates = jnp.where(frames > self.start_frames, total - before, 0.0).astype(jnp.int32)
         signal = self.env.signals[0]
-        learner, metrics = learn(
-            self.learner, state.learner, replay, updates, signal=signal, key=learn_key
-        )
+        given = {"signal": signal, "moments": moments, "key": learn_key}
+        learner, metrics = learn(self.learner, state.learner, replay, updates, **given)
 
         # Test the actor without noise, now and then.
-        actor = self.learner.actor(learner)
-        due = (frames // self.test_every > state.frames // self.test_every) | jnp.isnan(state.score)
+        actor = frozen(moments, self.learner.actor(learner))
+        due = frames // self.test_every > state.frames // self.test_every
+        due = due | ~jnp.isfinite(state.score)  # -inf: never tested
         score = when(
             due,
             lambda: rollout.score(self.env, actor, self.test_episodes, key=test_key),
@@ -151,4 +168,4 @@ class OffPolicy(eqx.Module):
             "frames": new,
             "updates": updates,
         }
-        return OffPolicyState(learner, replay, actor, score, frames), metrics
+        return OffPolicyState(learner, replay, actor, score, frames, moments), metrics

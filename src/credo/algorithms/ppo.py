@@ -2,8 +2,9 @@
 generalized advantages (equation 11): the on-policy baseline of Chapter 5.
 
 Departures: a generation plays whole episodes, as many as last time's length says `horizon` frames
-need (at most `copies`), so that its end is a state to resume from. Observations and rewards are not
-normalised, which most implementations do in silence: the policy acts on what the task says. The
+need (at most `copies`), so that its end is a state to resume from. Rewards are not
+normalised, and observations only with `normalize_observations`; most implementations do both in
+silence. The
 clipped gradient, the first deviation and the tanh around the mean are not the paper's.
 """
 
@@ -17,11 +18,12 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .. import require, rollout, tree
-from ..compilation import jit, when
-from ..learners.base import act, adam, adam_state, require_memoryless
+from ..compilation import float32, jit, when
+from ..learners.base import act, adam, adam_state, averaged, require_memoryless
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import Explorer, GaussianNoise
 from ..networks.mlp import MLP, Critic, CriticNetwork
+from ..normalization import Moments, behind, frozen, seen, warmed, watched
 from ..replay import Replay, extend
 from ..rollout import Environment, blank, collect
 from ..types import Metrics, Transition
@@ -60,6 +62,7 @@ class PPOState(eqx.Module):
     score: Float[Array, ""]
     length: Float[Array, ""]  # mean frames of an episode, last time
     frames: Int[Array, ""]
+    moments: Moments | None  # of what was seen; None: observations are as they are
 
 
 class PPO(eqx.Module):
@@ -87,6 +90,9 @@ class PPO(eqx.Module):
     test_episodes: int = eqx.field(static=True, default=10)  # without noise; not counted
     test_every: int = eqx.field(static=True, default=5_000)  # frames between tests
     signal: str | None = eqx.field(static=True, default=None)  # reward; None: the task's first
+    normalize_observations: bool = eqx.field(static=True, default=False)
+    """Actor and critic see observations by the running mean and variance of all that was seen; the
+    champion keeps them."""
 
     def __check_init__(self):
         require.fits(self.env, self.network, self)
@@ -109,6 +115,7 @@ class PPO(eqx.Module):
         """Settings by name, for the command line."""
         return {"ppo": cls.ppo}
 
+    @float32()
     def init(self, *, key: PRNGKeyArray) -> PPOState:
         env = self.env
         require.continuous(env, self)
@@ -122,9 +129,12 @@ class PPO(eqx.Module):
         replay = Replay.empty(blank(env), min(most, self.horizon + 8 * env.max_steps))
         opt = adam_state((actor, critic))
         length = jnp.float32(min(self.horizon, env.max_steps))
-        score = jnp.float32(jnp.nan)
-        return PPOState(actor, critic, opt, replay, mean, score, length, jnp.int32(0))
+        score = jnp.float32(-jnp.inf)
+        moments = Moments.first(env) if self.normalize_observations else None
+        rest = (score, length, jnp.int32(0), moments)
+        return PPOState(actor, critic, opt, replay, frozen(moments, mean), *rest)
 
+    @float32()
     def generation(self, state: PPOState, *, key: PRNGKeyArray) -> tuple[PPOState, Metrics]:
         explore_key, learn_key, test_key = jax.random.split(key, 3)
 
@@ -136,7 +146,7 @@ class PPO(eqx.Module):
         )
         played, experience = collect(
             self.env,
-            tree.stack(explorer),
+            behind(state.moments, tree.stack(explorer)),
             self.copies,
             wanted=wanted,
             common=False,
@@ -150,13 +160,15 @@ class PPO(eqx.Module):
         # Compute advantages; optimize the surrogate with K epochs of minibatches.
         networks = (state.actor, state.critic)
         actor, critic, opt, metrics = improve(
-            self, networks, state.optimizer, replay, key=learn_key
+            self, networks, state.optimizer, replay, state.moments, key=learn_key
         )
+        champion, moments = frozen(state.moments, actor.mean), watched(state.moments, experience)
 
-        due = (frames // self.test_every > state.frames // self.test_every) | jnp.isnan(state.score)
+        due = frames // self.test_every > state.frames // self.test_every
+        due = due | ~jnp.isfinite(state.score)  # -inf: never tested
         score = when(
             due,
-            lambda: rollout.score(self.env, actor.mean, self.test_episodes, key=test_key),
+            lambda: rollout.score(self.env, champion, self.test_episodes, key=test_key),
             lambda: state.score,
         )
         returns = played.returns[self.signal or self.env.signals[0]][0]
@@ -168,11 +180,19 @@ class PPO(eqx.Module):
             "frames": new,
         }
         length = new.astype(jnp.float32) / wanted.astype(jnp.float32)
-        return PPOState(actor, critic, opt, replay, actor.mean, score, length, frames), metrics
+        rest = (champion, score, length, frames, moments)
+        return PPOState(actor, critic, opt, replay, *rest), metrics
 
     def warm(self, state: PPOState, policy: AbstractPolicy) -> PPOState:
         """`state` that goes on from a saved policy of the same network."""
-        return eqx.tree_at(lambda s: s.actor.mean, state, policy)
+        mean, moments = warmed(policy, state.moments)
+        parts = (mean, policy, moments)
+        return eqx.tree_at(
+            lambda s: (s.actor.mean, s.champion, s.moments),
+            state,
+            parts,
+            is_leaf=lambda x: x is None,
+        )
 
 
 @jit
@@ -181,11 +201,12 @@ def improve(
     networks: tuple[Actor, CriticNetwork],
     optimizer: optax.OptState,
     replay: Replay,
+    moments: Moments | None,
     *,
     key: PRNGKeyArray,
 ) -> tuple[Actor, CriticNetwork, optax.OptState, Metrics]:
     """K epochs of minibatches of M frames. How many frames there are is data."""
-    sample = prepare(ppo, networks, replay)
+    sample = prepare(ppo, networks, replay, moments)
     batches = replay.size // ppo.batch_size
     weights, static = eqx.partition(networks, eqx.is_inexact_array)
 
@@ -210,17 +231,23 @@ def improve(
     loop = jax.lax.fori_loop(0, ppo.epochs, epoch, (weights, optimizer, zeros))
     weights, opt, total = loop
     actor, critic = eqx.combine(weights, static)
-    count = (ppo.epochs * batches).astype(jnp.float32)
-    return actor, critic, opt, {name: x / count for name, x in total.items()}
+    return actor, critic, opt, averaged(total, ppo.epochs * batches)
 
 
-def prepare(ppo: PPO, networks: tuple[Actor, CriticNetwork], replay: Replay) -> Sample:
-    """Advantages by equation 11 and what goes with them, normalised over the frames."""
+def prepare(
+    ppo: PPO,
+    networks: tuple[Actor, CriticNetwork],
+    replay: Replay,
+    moments: Moments | None = None,
+) -> Sample:
+    """Advantages by equation 11 and what goes with them, normalised over the frames; observations
+    as they were when the policy acted."""
     actor, critic = networks
     rows: Transition = replay.data
     filled = jnp.arange(replay.capacity) < replay.size
     reward = rows.rewards[ppo.signal or ppo.env.signals[0]]
-    value, after = (_value(critic, obs) for obs in (rows.obs, rows.next_obs))
+    obs, next_obs = seen(moments, rows.obs), seen(moments, rows.next_obs)
+    value, after = _value(critic, obs), _value(critic, next_obs)
     delta = reward + ppo.gamma * jnp.where(rows.terminated, 0.0, after) - value
     # Rows come episode by episode.
     goes_on = ~(rows.terminated | rows.truncated) & jnp.append(filled[1:], False)
@@ -229,9 +256,9 @@ def prepare(ppo: PPO, networks: tuple[Actor, CriticNetwork], replay: Replay) -> 
     mean = jnp.sum(jnp.where(filled, advantage, 0.0)) / n
     variance = jnp.sum(jnp.where(filled, jnp.square(advantage - mean), 0.0)) / n
     return Sample(
-        rows.obs,
+        obs,
         rows.action,
-        actor.log_density(rows.obs, rows.action),
+        actor.log_density(obs, rows.action),
         (advantage - mean) / (jnp.sqrt(variance) + 1e-8),
         advantage + value,
     )

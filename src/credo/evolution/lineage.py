@@ -1,10 +1,12 @@
 """Lineage: where each member of a population comes from, and what became of injected ones."""
 
+from functools import partial
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-DRAWN, MUTATED, CROSSED, CROSSED_AND_MUTATED, INJECTED = range(5)
+DRAWN, MUTATED, CROSSED, CROSSED_AND_MUTATED, INJECTED = range(5)  # of two the sum is both
 MAKERS = ("drawn", "mutation", "crossover", "crossover and mutation", "learner")
 
 
@@ -45,20 +47,13 @@ class Lineage(eqx.Module):
         share `taken` of its weights from its mate if it was crossed."""
         from_mate = jnp.where(crossed, taken, 0.0)[:, None]
         share = (1.0 - from_mate) * self.share[parents] + from_mate * self.share[mates]
-        made = jnp.where(
-            mutated,
-            jnp.where(crossed, CROSSED_AND_MUTATED, MUTATED),
-            jnp.where(crossed, CROSSED, self.maker[parents]),
-        )
-        return Lineage(
-            jnp.concatenate([self.maker[elites], made]),
-            jnp.concatenate([self.share[elites], share]),
-            jnp.full_like(self.guest, -1),
-            *(
-                jnp.zeros_like(x).at[: len(elites)].set(x[elites])
-                for x in (self.earned, self.times)
-            ),
-        )
+        made = MUTATED * mutated.astype(jnp.int32) + CROSSED * crossed.astype(jnp.int32)
+        made = jnp.where(mutated | crossed, made, self.maker[parents])
+        maker = jnp.concatenate([self.maker[elites], made])
+        share = jnp.concatenate([self.share[elites], share])
+        lived, e = (self.earned, self.times), len(elites)
+        lived = (jnp.zeros_like(x).at[:e].set(x[elites]) for x in lived)
+        return Lineage(maker, share, jnp.full_like(self.guest, -1), *lived)
 
     def inject(self, slot: int, learner: int) -> "Lineage":
         """With a learner's actor in a slot."""
@@ -79,12 +74,6 @@ class Lineage(eqx.Module):
         selected = jnp.any(members[:, None] == parents[None], axis=1) & ~elite
         learners = jnp.arange(self.share.shape[1] - 1)
         mine = self.guest[:, None] == learners[None]
-
-        def count(which):
-            return jnp.sum((mine & which[:, None]).astype(jnp.int32), axis=0)
-
-        return {
-            "elite": count(elite),
-            "selected": count(selected),
-            "discarded": count(~elite & ~selected),
-        }
+        fates = {"elite": elite, "selected": selected, "discarded": ~elite & ~selected}
+        count = partial(jnp.sum, axis=0, dtype=jnp.int32)
+        return {name: count(mine & which[:, None]) for name, which in fates.items()}

@@ -13,8 +13,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from ..compilation import jit
 from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..normalization import Moments, seen
 from ..replay import Replay
-from ..types import Batch, Metrics
+from ..types import NOTHING, Batch, Metrics
 
 
 class AbstractLearner(eqx.Module):
@@ -61,13 +62,14 @@ def learn(
     """`updates` gradient steps, each on a minibatch of its own, in one program. Their number is
     data.
 
-    **Arguments:** `signal`: what a learner optimises that names no reward itself. `key`.
+    **Arguments:** `signal`: what a learner optimises that names no reward itself. `moments`:
+    what observations are normalised by. `key`.
 
-    **Returns:** the new state and the mean of each metric; NaN if there was no update.
+    **Returns:** the new state and the mean of each metric; NOTHING if there was no update.
     """
     if not isinstance(updates, jax.core.Tracer) and updates == 0:
         # Nothing need be compiled for it: the first fitness of a run comes sooner.
-        return state, {name: jnp.float32(jnp.nan) for name in learner.metrics}
+        return state, {name: jnp.float32(NOTHING) for name in learner.metrics}
     return _learn(learner, state, replay, updates, **rest)
 
 
@@ -79,6 +81,7 @@ def _learn(
     updates: Int[Array, ""],
     *,
     signal: str,
+    moments: Moments | None = None,
     key: PRNGKeyArray,
 ) -> tuple[PyTree, Metrics]:
     dynamic, static = eqx.partition(state, eqx.is_array)
@@ -89,22 +92,24 @@ def _learn(
         rows = replay.sample(learner.batch_size, together=learner.together, key=sample_key)
         reward = rows.rewards[learner.signal or signal]
         ends = (rows.terminated, rows.truncated, rows.active)
-        batch = Batch(rows.obs, rows.action, reward, rows.next_obs, *ends)
+        obs, after = seen(moments, rows.obs), seen(moments, rows.next_obs)
+        batch = Batch(obs, rows.action, reward, after, *ends)
         state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)
         return eqx.filter(state, eqx.is_array), jax.tree.map(jnp.add, total, metrics)
 
     zeros = {name: jnp.float32(0.0) for name in learner.metrics}
     dynamic, total = jax.lax.fori_loop(0, updates, body, (dynamic, zeros))
-    count = updates.astype(jnp.float32)
-    return eqx.combine(dynamic, static), jax.tree.map(lambda x: x / count, total)
+    return eqx.combine(dynamic, static), averaged(total, updates)
+
+
+def averaged(total: Metrics, count: Int[Array, ""]) -> Metrics:
+    """Means of sums over `count`; NOTHING if that is 0."""
+    n = jnp.maximum(count, 1).astype(jnp.float32)
+    return jax.tree.map(lambda x: jnp.where(count > 0, x / n, NOTHING), total)
 
 
 def adam(
-    weights: PyTree,
-    gradient: PyTree,
-    state: optax.OptState,
-    rate: Float[Array, ""] | float,
-    max_norm: float | None = None,
+    weights: PyTree, gradient: PyTree, state: optax.OptState, rate: Any, max_norm: Any = None
 ) -> tuple[PyTree, optax.OptState]:
     """One step of Adam (Kingma & Ba 2015) down the gradient, clipped to a global norm."""
     # Optax multiplies counters by floats, which strict promotion of dtypes would refuse.

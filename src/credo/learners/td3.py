@@ -120,24 +120,22 @@ class TD3(AbstractLearner):
         critics, critic_opt = adam(
             state.critics, gradient, state.critic_opt, self.critic_lr, self.critic_max_norm
         )
-        moving = (state.actor, state.actor_opt, state.target_actor, state.target_critics)
+        moving = (state.actor, state.target_actor, state.target_critics, state.actor_opt)
 
         def move_policy():
-            actor, actor_opt, target_actor, target_critics = moving
+            actor, target_actor, target_critics, actor_opt = moving
             gradient = eqx.filter_grad(actor_loss)(actor, critics[0], batch)
             actor, actor_opt = adam(actor, gradient, actor_opt, self.actor_lr, self.actor_max_norm)
-            target_actor = polyak(target_actor, actor, self.tau)
-            return actor, actor_opt, target_actor, polyak(target_critics, critics, self.tau)
+            targets = (target_actor, target_critics)
+            return actor, *polyak(targets, (actor, critics), self.tau), actor_opt
 
         if self.policy_delay > 1:
             due = state.step % self.policy_delay == 0
             moving = jax.lax.cond(due, move_policy, lambda: moving)
         else:
             moving = move_policy()
-        actor, actor_opt, target_actor, target_critics = moving
-        targets, opts = (target_actor, target_critics), (actor_opt, critic_opt)
-        state = TD3State(actor, critics, *targets, *opts, state.step + 1, state.agents)
-        return state, {"critic_loss": critic_loss, "q": q}
+        after = (moving[0], critics, *moving[1:], critic_opt, state.step + 1)
+        return TD3State(*after, state.agents), {"critic_loss": critic_loss, "q": q}
 
     def bellman_target(
         self, state: TD3State, batch: Batch, *, key: PRNGKeyArray
@@ -149,9 +147,7 @@ class TD3(AbstractLearner):
         pair = (features_first(batch.next_obs), features_first(action))
         qs = [critic(*pair) for critic in state.target_critics]
         q = jnp.min(jnp.stack(qs), axis=0)
-        ended = batch.terminated
-        if not self.bootstrap_truncated:
-            ended = ended | batch.truncated
+        ended = batch.terminated | (batch.truncated & (not self.bootstrap_truncated))
         reward = self.reward_scale * batch.reward
         return reward + self.gamma * jnp.where(ended, 0.0, q)
 

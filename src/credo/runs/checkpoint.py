@@ -342,8 +342,9 @@ def _fit(
         if name in empty:
             return jnp.zeros(wanted[name].shape, wanted[name].dtype)
         data = arrays.pop(name)
-        # One leaf at a time: a buffer may fill most of the memory.
-        array = jnp.array(_read_rows(data) if isinstance(data, segments.Stored) else data)
+        # One leaf at a time, copied once: a buffer may fill most of the memory.
+        read = _read_rows(data) if isinstance(data, segments.Stored) else data
+        array = jax.block_until_ready(jax.device_put(read, may_alias=False))
         if array.dtype != data.dtype:
             raise CheckpointError(f"{path}: {name} is {_describe(data)}: set jax_enable_x64")
         return jax.random.wrap_key_data(array, impl=keys[name]) if name in keys else array

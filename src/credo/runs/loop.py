@@ -29,6 +29,7 @@ from .. import compilation, require
 from ..compilation import jit
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..replay import Replay, shapes_alone
+from ..types import NOTHING
 from . import checkpoint, config, files, log, policy, record, screen, weights
 from .budget import Budget, fitted
 from .folder import free_name, new_folder
@@ -89,6 +90,7 @@ class Run:
         return log.read(self.path / "metrics.csv")
 
     @property
+    @compilation.float32()
     def champion(self) -> PyTree:
         """The policy with the highest fitness of the last generation; of a learner alone, its
         actor. Raises `RunError` if it is another run's, or if the task has other sizes today."""
@@ -108,6 +110,7 @@ class Run:
 
 
 @screen.calm()
+@compilation.float32()
 def train(
     algorithm: Any,
     *,
@@ -191,6 +194,7 @@ def train(
 
 
 @screen.calm()
+@compilation.float32()
 def resume(
     path: str | pathlib.Path,
     *,
@@ -471,6 +475,7 @@ def play(
     batch = []
     for i in range(int(count)):
         row = {name: column[i].item() for name, column in columns.items()}
+        row = {name: np.nan if value == NOTHING else value for name, value in row.items()}
         frames += int(row.pop("frames"))
         batch.append({"generation": generation + i + 1, "frames": frames, **row})
     return state, batch
