@@ -1,4 +1,5 @@
 import os
+import tempfile
 
 # Tests run one worker per core: one thread each, and programs compiled for speed of compiling.
 os.environ.setdefault(
@@ -14,6 +15,10 @@ compilation.enable_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Runs are signed with a key in the user's own folder: here one for all tests of a process.
+settings = tempfile.TemporaryDirectory(prefix="credo-tests-")
+os.environ["XDG_CONFIG_HOME"] = settings.name
 
 
 @pytest.fixture(autouse=True, scope="module")

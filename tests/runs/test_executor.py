@@ -1,6 +1,8 @@
 """Many runs, a process each: what is finished stays, what fails is told, the rest goes on."""
 
 import dataclasses
+import json
+import os
 import signal
 import subprocess
 import sys
@@ -12,7 +14,7 @@ import pytest
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.sequence_classification import SequenceClassification
 from credo.networks.mmu import MMU
-from credo.runs import config, executor, loop
+from credo.runs import config, executor, loop, worker
 
 ALGORITHM = Neuroevolution(
     SequenceClassification(depth=2, min_gap=1, max_gap=2),
@@ -169,3 +171,98 @@ def test_a_signal_reaches_every_worker_and_each_saves(tmp_path):
     for path in paths:
         newest = sorted(folder.name for folder in (path / "checkpoints").glob("[0-9]*"))[-1]
         assert int(newest) == loop.Run(path).metrics["generation"][-1] >= 1
+
+
+def test_a_worker_is_told_its_path_as_json(monkeypatch, tmp_path):
+    """A folder may have a colon in its name, and a script may have added to the path."""
+    folder = tmp_path / "a:b"
+    folder.mkdir()
+    (folder / "mine_alone.py").write_text("")
+    monkeypatch.syspath_prepend(str(folder))
+    *start, script, path, core = worker.command(0)
+    assert json.loads(path)[0] == str(folder)
+    script = script.replace("worker.main(int(sys.argv[2]))", "import mine_alone")
+    done = subprocess.run([*start, script, path, core], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
+def gone(pid, seconds=20):
+    """Whether a process ends in this time; one that nobody waits for has ended too."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        try:
+            with open(f"/proc/{pid}/stat") as file:
+                if file.read().rpartition(")")[2].split()[0] == "Z":
+                    return True
+        except OSError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+# Deaf to signals, with a child in its group; it says who they are.
+DEAF = """
+import os, signal, subprocess, sys, time
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+child = subprocess.Popen(["sleep", "100"])
+open(sys.argv[1], "w").write(f"{os.getpid()} {child.pid} ")
+time.sleep(100)
+"""
+RUNS = """
+import sys
+from credo.runs import executor, worker
+from credo.runs.budget import Budget
+worker.command = lambda core: [sys.executable, "-c", sys.argv[1], sys.argv[2]]
+executor.Job.finished = lambda self: False
+executor.run([executor.Job(sys.argv[2] + "-run", {"class": "a:B"}, 5, seed=0)], workers=1)
+"""
+
+
+@linux
+def test_a_second_signal_ends_workers_that_are_deaf_to_it(tmp_path):
+    told = tmp_path / "told"
+    process = subprocess.Popen([sys.executable, "-c", RUNS, DEAF, str(told)], stderr=-1, text=True)
+    try:
+        deadline = time.monotonic() + 60
+        while not (told.exists() and told.read_text().endswith(" ")):
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.5)
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        began = time.monotonic()
+        _, said = process.communicate(timeout=30)
+        assert time.monotonic() - began < 15
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == 130, said
+    assert "credo: stopping after this generation; once more to stop at once" in said
+    assert [gone(int(pid)) for pid in told.read_text().split()] == [True, True]
+
+
+@linux
+def test_workers_end_with_a_parent_that_is_killed():
+    child = "import os; from credo.runs import worker; worker._ask_for_death(os.getppid())\n"
+    child += "print(os.getpid(), flush=True); import time; time.sleep(100)"
+    script = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    assert not gone(pid, 0.2)
+    parent.kill()
+    parent.communicate()
+    assert gone(pid)
+
+
+def test_what_a_stranger_recorded_is_not_trusted_by_a_worker(tmp_path):
+    job = executor.Job(tmp_path, ALGORITHM, 5, seed=0)
+    assert json.loads(job.message())["trust"] is True
+    tree = json.loads(json.dumps(config.to_tree(ALGORITHM))) | {"class": "nowhere:Algorithm"}
+    job = executor.Job(tmp_path, tree, 5, seed=0)
+    assert json.loads(job.message())["trust"] is False  # and nothing was imported for it
+    assert config.changed(tree, tree) == []
+    assert os.listdir(tmp_path) == []

@@ -265,7 +265,7 @@ def changed(recorded: Any, today: Any) -> list[str]:
     """Where the tree of an object that was recorded differs from today's tree of one. A field that
     came after the record has its default. Nothing that only the record names is imported or made.
     Raises `ConfigError` if a class has no such field today."""
-    return differences(_completed(recorded, today), today)
+    return [] if recorded == today else differences(_completed(recorded, today), today)
 
 
 def _completed(recorded: Any, today: Any) -> Any:

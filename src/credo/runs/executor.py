@@ -53,9 +53,9 @@ class Job:
 
     @property
     def budget(self) -> Budget:
-        algorithm = self.algorithm
-        if isinstance(algorithm, dict):
-            algorithm = config.find_class(algorithm["class"])
+        algorithm, limited = self.algorithm, (self.generations, self.frames) != (None, None)
+        if isinstance(algorithm, dict) and not limited:
+            algorithm = config.find_class(algorithm["class"])  # for its default
         return Budget.of(algorithm, self.generations, self.frames, self.stop_at)
 
     def finished(self) -> bool:
@@ -88,7 +88,10 @@ class Job:
     def message(self) -> str:
         budget = self.budget.record()
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return json.dumps(fields | budget | {"path": str(self.path), "algorithm": self.tree})
+        # Objects are the caller's own; a tree may be what a stranger recorded.
+        own = {"trust": not isinstance(self.algorithm, dict)}
+        fields |= {"path": str(self.path), "algorithm": self.tree}
+        return json.dumps(fields | budget | own)
 
     def state(self) -> str:
         """How far it is, in a few words."""

@@ -86,7 +86,7 @@ class Run:
     def metrics(self) -> dict[str, np.ndarray]:
         """Columns of `metrics.csv`, one entry per generation. Raises `RunError` if it is not what
         the newest checkpoint says it was."""
-        _verify_metrics(self.path)
+        _verify_metrics(self)
         return log.read(self.path / "metrics.csv")
 
     @property
@@ -247,6 +247,8 @@ def resume(
             budget.refuse_smaller(old, saved.generation, int(saved.counters["frames"]))
         except ValueError as error:
             raise RunError(str(error)) from None
+        for change in run.config.get("changes", []):  # of an older checkpoint it begins earlier
+            change["generation"] = min(change["generation"], saved.generation)
         fit = _changed(run, fit, set or {}, saved.generation)
         _record_budget(run, old, budget, saved.generation)
         if run.config != record.read(run.path) or (trust and not signed_here(run.config)):
@@ -335,18 +337,19 @@ def _json(text: str | None) -> Any:
         return None
 
 
-def _verify_metrics(path: pathlib.Path) -> None:
+def _verify_metrics(run: Run) -> None:
     """Raise `RunError` if metrics.csv is not what the newest intact checkpoint says it was."""
-    for folder in sorted((path / "checkpoints").glob("[0-9]*"), reverse=True):
+    for folder in sorted((run.path / "checkpoints").glob("[0-9]*"), reverse=True):
         try:
-            sealed = json.loads(files.read_bytes(folder / checkpoint.COMMIT))["seals"]["metrics"]
+            seals = json.loads(files.read_bytes(folder / checkpoint.COMMIT))["seals"]
+            sealed = seals["metrics"]
         except (OSError, ValueError, KeyError, TypeError):
             continue  # damaged, or written by an older version
-        why = _unlike(path, sealed)
+        why = _unlike(run.path, sealed)
         if why is None:
             return
-        if checkpoint.damage(folder) is None:
-            raise RunError(f"{why}, or `credo resume {path}` trains again what is not sure")
+        if checkpoint.damage(folder) is None and not record.stranger(run.config, seals["record"]):
+            raise RunError(f"{why}, or `credo resume {run.path}` trains again what is not sure")
 
 
 def _unlike(path: pathlib.Path, sealed: Any) -> str | None:
@@ -548,11 +551,14 @@ def _warm(algorithm: Any, state: PyTree, source: Run) -> PyTree:
     except checkpoint.CheckpointError as error:
         if "does not fit" not in str(error):
             raise  # it is missing or damaged
-        theirs, ours = source.algorithm.network, algorithm.network
+        theirs = [
+            source.part(name) or config.brief(source.config["algorithm"][name])
+            for name in ("network", "env")
+        ]
         raise RunError(
-            f"the champion of {source.path} is {theirs} on {source.algorithm.env}, and this run is "
-            f"{ours} on {algorithm.env}: give the same --preset or --network, and a task of the "
-            f"same sizes ({str(error).splitlines()[0]})"
+            f"the champion of {source.path} is {theirs[0]} on {theirs[1]}, and this run is "
+            f"{algorithm.network} on {algorithm.env}: give the same --preset or --network, and a "
+            f"task of the same sizes ({str(error).splitlines()[0]})"
         ) from error
     return algorithm.warm(state, policy)
 

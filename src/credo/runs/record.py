@@ -105,7 +105,8 @@ def stranger(record: Mapping[str, Any], sealed: Any) -> str | None:
 def task_of(env: Any) -> dict[str, Any]:
     """What a record says of a task: its sizes, what its actions are outside JAX, and from which
     folder it was found."""
-    told, inner = None, env
+    told: Any = None
+    inner = env
     while told is None and inner is not None:  # a delayed task is still that task
         told = getattr(inner, "task_record", None)
         inner = getattr(inner, "env", None)
@@ -114,9 +115,9 @@ def task_of(env: Any) -> dict[str, Any]:
         folder = os.fsencode(os.getcwd()).decode(errors="replace")
     except OSError:  # it was removed
         folder = None
-    sizes = {name: getattr(env, name, None) for name in (*SIZES, "discrete")}
-    sizes["discrete"] = bool(sizes["discrete"])
-    return {**sizes, "actions": None, "observations": None} | dict(told or {}) | {"folder": folder}
+    sizes: dict[str, Any] = {name: getattr(env, name, None) for name in SIZES}
+    sizes |= {"discrete": bool(getattr(env, "discrete", False))}
+    return sizes | {"actions": None, "observations": None} | (told or {}) | {"folder": folder}
 
 
 def check_task(record: Mapping[str, Any], env: Any) -> None:

@@ -54,6 +54,7 @@ class Stream:
 @contextlib.contextmanager
 def calm() -> Iterator[None]:
     """Inside the block nothing that is written to stdout or stderr can raise, whoever writes it."""
+    occupy()
     before = sys.stdout, sys.stderr
     now = tuple(x if isinstance(x, Stream) else Stream(x) for x in before)
     sys.stdout, sys.stderr = now  # pyright: ignore[reportAttributeAccessIssue]

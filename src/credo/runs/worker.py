@@ -94,8 +94,8 @@ def _train(job: dict[str, Any]) -> None:
 
     path, options = pathlib.Path(job["path"]), {name: job[name] for name in OPTIONS}
     if (path / "config.json").exists():
-        # Its settings are those of the job, which the parent named (`Job.finished`).
-        loop.resume(path, trust=True, progress=False, **options)
+        # Its settings are those of the job: the parent looked (`Job.finished`).
+        loop.resume(path, trust=job["trust"], progress=False, **options)
     else:
         algorithm = config.from_tree(job["algorithm"])
         start = {"seed": job["seed"], "warm_start": job["warm_start"]}
