@@ -582,14 +582,15 @@ class Centralized:
 
 
 class Normalized:
-    """`credo.networks.normalized`: observations with mean 0 and standard deviation 1, clipped to
-    [-10, 10], for the network within."""
+    """`credo.networks.normalized`: observations with mean 0 and standard deviation 1, of each agent
+    of a team, clipped to [-10, 10], for the network within."""
 
     team: ClassVar[bool | None] = None  # that of the network within
     parts: ClassVar[bool] = True
 
     def __init__(self, config: Any, claim: Claim, x: int, y: int, agents: int | None, part: Any):
-        self._mean, self._std = claim("mean", x), claim("std", x)
+        shape = (x,) if agents is None else (agents, x)
+        self._mean, self._std = claim("mean", *shape), claim("std", *shape)
         if not (self._std > 0).all():
             raise ValueError(f"std is {self._std}: it must be more than 0")
         self._inner = part(0, "policy", x, y, agents)

@@ -18,6 +18,7 @@ from credo.networks.base import ACTIVATIONS, AbstractNetwork, AbstractPolicy
 from credo.networks.dmmu import DMMU, ORDERS
 from credo.networks.mlp import MLP, NORMALIZATIONS
 from credo.networks.mmu import MMU
+from credo.networks.normalized import Normalized
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Centralized, Team
 from credo.runner import DESCRIPTION, VERSION, Runner
@@ -79,12 +80,12 @@ def plant(space):
     return Gymnasium("test_export:Plant", {"space": space}, max_episode_steps=5, in_process=True)
 
 
-def made(path, env, network, seed=0, action=None) -> Run:
+def made(path, env, network, seed=0, action=None, champion=None, **settings) -> Run:
     """A run on disk whose champion has fresh weights. `action`: the space in its record."""
     path.mkdir()
-    algorithm = Neuroevolution(env, network, population_size=10)
-    policy = network.init(*env.sizes, key=jax.random.key(seed))
-    checkpoint.export_policy(path / "champion.safetensors", policy)
+    algorithm = Neuroevolution(env, network, population_size=10, **settings)
+    champion = champion or network.init(*env.sizes, key=jax.random.key(seed))
+    checkpoint.export_policy(path / "champion.safetensors", champion)
     task = {name: getattr(env, name) for name in ("obs_size", "action_size", "agents", "discrete")}
     task["actions"] = action and adapters._described(action)
     record = {"algorithm": config.to_tree(algorithm), "seed": seed, "task": task}
@@ -136,6 +137,27 @@ def test_the_runner_acts_as_a_team_over_an_episode(network):
     np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-5)
     act.reset()
     np.testing.assert_array_equal([act(obs) for obs in fleet()], theirs)
+
+
+@pytest.mark.parametrize("network", [MMU(4), Team((5,), Recurrent("gru", 3))], ids=str)
+def test_normalised_observations_are_those_of_training(tmp_path, network):
+    agents = AGENTS if network.team else None
+    env = SimpleSpread(agents=AGENTS) if network.team else SequenceRecall(depth=2)
+    _, _, *team = env.sizes
+    policy = network.init(*env.sizes, key=jax.random.key(0))
+    random = np.random.default_rng(3)
+    mean = random.normal(size=(*team, env.obs_size)).astype(np.float32)
+    std = random.uniform(0.05, 2.0, mean.shape).astype(np.float32)
+    champion = Normalized(policy, jax.numpy.asarray(mean), jax.numpy.asarray(std))
+    run = made(tmp_path / "run", env, network, normalize_observations=True, champion=champion)
+    ours, act = run.policy(), Runner.load(export(run, tmp_path / "p.safetensors"))
+    assert act.agents == agents
+    plain = Policy(policy)
+    obs = random.normal(size=(STEPS, *mean.shape)).astype(np.float32)
+    actions = np.array([ours(x) for x in obs])
+    np.testing.assert_allclose([act(x) for x in obs], actions, rtol=0, atol=1e-5)
+    expected = [plain(np.clip((x - mean) / std, -10.0, 10.0)) for x in obs]
+    np.testing.assert_allclose(actions, expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("cell", ["mmu", "gru"])

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from ..compilation import float32
 from ..environments.wrappers import DelayedHostReward, DelayedReward
+from ..networks.normalized import Normalized
 from ..networks.team import Team
 from ..runner import Units
 from .record import RunError
@@ -35,6 +37,7 @@ class Policy:
         self._units = None if task is None else Units(task)
         self.reset()
 
+    @float32()
     def reset(self, seed: int = 0) -> None:
         """Forget: call at the start of every episode. `seed` decides what the policy draws, if it
         draws."""
@@ -58,6 +61,7 @@ class Policy:
             return self._step(np.asarray(observation, np.float32))
         return self._units.act(observation, self._step, mask)
 
+    @float32()
     def _step(self, obs: np.ndarray) -> np.ndarray:
         action, self._carry = self._play(self._arrays, jnp.asarray(obs), self._carry)
         return np.asarray(action)
@@ -69,6 +73,7 @@ def of(run: Any, raw: bool = False) -> Policy:
     return Policy(champion(run), task, raw=raw)
 
 
+@float32()
 def champion(run: Any) -> PyTree:
     """The policy in a run's folder. Where its record tells the task's sizes and its networks are
     Credo's own, no environment is opened, and nothing of somebody's own is imported."""
@@ -87,10 +92,8 @@ def _like(network: Any, normalized: bool | None, units: Units) -> PyTree:
     like = eqx.filter_eval_shape(network.init, *sizes, key=jax.random.key(0))
     if not normalized:
         return like
-    from ..networks.normalized import Normalized  # pyright: ignore[reportMissingImports]
-
-    shape = jax.ShapeDtypeStruct((units.obs_size,), jnp.float32)
-    return Normalized(like, shape, shape)
+    numbers: Any = jax.ShapeDtypeStruct((*sizes[2:], units.obs_size), jnp.float32)
+    return Normalized(like, numbers, numbers)
 
 
 def _units(run: Any) -> Units:
