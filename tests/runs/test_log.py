@@ -190,7 +190,7 @@ def test_a_clock_that_cannot_be_written_stops_nothing(written):
 )
 def test_a_damaged_clock_is_begun_anew(written, content):
     (written / "timing.csv").write_bytes(content)
-    with pytest.warns(UserWarning, match=r"timing\.csv .*begun anew; .*no result is"):
+    with pytest.warns(UserWarning, match=r"timing\.csv is .*; timing\.csv is begun anew: "):
         journal = log.Log(written, 5, tensorboard=False)
     assert journal.elapsed == 0.0
     journal.append([{"generation": 6, "score": 0.0, "nan": 0}], 0.5, 2.0)

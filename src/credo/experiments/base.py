@@ -181,7 +181,7 @@ def kept(path: pathlib.Path, cells: list[Cell], chosen: list[Cell]) -> dict[str,
     if not path.exists():
         return None
     try:
-        record = json.loads(path.read_text())
+        record = json.loads(files.read_text(path))
         measured, recorded, machine, _ = (
             record[name] for name in ("measured", "cells", "machine", "command")
         )
@@ -258,7 +258,7 @@ def seeds(cell: Cell) -> range:
 
 def page(results: pathlib.Path) -> pathlib.Path:
     """Write `report.html` beside a `results.json`, from its numbers alone."""
-    record = json.loads(results.read_text())
+    record = json.loads(files.read_text(results))
     module: Any = importlib.import_module(f".{MODULES[record['experiment']]}", __package__)
     cells = record["cells"]
     machines = [

@@ -119,10 +119,9 @@ def read_bytes(path: str | os.PathLike[str], most: int = MOST) -> bytes:
     descriptor = opened(path, os.O_RDONLY, follow=True)
     with open(descriptor, "rb") as file:
         size = os.fstat(descriptor).st_size
-        data = file.read(most + 1) if size <= most else b""
-    if size > most or len(data) > most:
-        raise ValueError(f"{path} has {max(size, len(data)):,} bytes: at most {most:,} are read")
-    return data
+        if size > most:
+            raise ValueError(f"{path} has {size:,} bytes: at most {most:,} are read")
+        return file.read()
 
 
 def read_text(path: str | os.PathLike[str], most: int = MOST) -> str:

@@ -98,7 +98,8 @@ class Log:
                 raise DamagedLog(f"{path} is not the clock of a run")
             self.elapsed = float(seconds[-1])
         except ValueError as error:
-            _warn(f"{error}: begun anew; times in it are lost, no result is")
+            why = str(error).removesuffix(f"; {HELP}")
+            _warn(f"{why}; {TIMING} is begun anew: past times are lost, no result is")
             files.remove(path)
 
     def _begin_events(self, generation: int):
