@@ -374,3 +374,15 @@ SEQUENCES = {
 @pytest.mark.parametrize("broken", SEQUENCES, ids=lambda broken: broken.__name__)
 def test_a_broken_sequence_task_is_named_with_its_fix(broken):
     assert_told(check_environment(broken(delay=2)), SEQUENCES[broken])
+
+
+class WrongEnds(Meet):
+    """Says of three agents whether they ended; there are two."""
+
+    def _time_step(self, state, local, met):
+        told = super()._time_step(state, local, met)
+        return eqx.tree_at(lambda t: t.gone, told, jnp.zeros(3, bool), is_leaf=lambda x: x is None)
+
+
+def test_a_team_says_of_every_agent_whether_it_ended():
+    assert_told(check_environment(WrongEnds()), r"reset: gone has shape \(3,\): it must be \(2,\)")

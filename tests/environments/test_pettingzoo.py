@@ -1,6 +1,7 @@
 # ruff: noqa: E402
 """PettingZoo both ways: its teams arrive in arrays, its failures are named, ours pass its tests."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -9,8 +10,10 @@ import time
 import types
 import warnings
 
+import equinox as eqx
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -19,8 +22,10 @@ pettingzoo = pytest.importorskip("pettingzoo")
 with warnings.catch_warnings():  # about a game that its tests import
     warnings.simplefilter("ignore", DeprecationWarning)
     from pettingzoo.test import max_cycles_test, parallel_api_test, parallel_seed_test, render_test
+import broken_team
 from pettingzoo.utils.conversions import parallel_to_aec
 
+from credo import rollout, tree
 from credo.environments.checks import check_environment
 from credo.environments.foreign import close_all
 from credo.environments.gymnasium import Gymnasium
@@ -29,6 +34,11 @@ from credo.environments.pettingzoo import PettingZoo, to_pettingzoo
 from credo.environments.probes import Copy, Meet
 from credo.environments.simple_spread import SimpleSpread
 from credo.environments.wrappers import delayed
+from credo.learners.td3 import TD3
+from credo.networks.mlp import MLP, Critic
+from credo.networks.team import Team
+from credo.replay import Replay, extend
+from credo.types import Batch
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -191,7 +201,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_failure_is_named_and_the_next_copies_are_new(fault):
-    env = pair(kwargs=(("fault", fault),), timeout=2.0)
+    env = pair(kwargs=(("fault", fault),), timeout=2.0, tolerated=0.0)
     copies = env.copies(3)
     active, action = np.array([False, True, False]), np.zeros((3, 2, 2), np.float32)
     began = time.monotonic()
@@ -224,7 +234,7 @@ def test_a_failure_is_named_and_the_next_copies_are_new(fault):
     ],
 )
 def test_an_incomplete_answer_is_named(part, told, fix):
-    env = pair("Forgetful", kwargs={"part": part}, in_process=True)
+    env = pair("Forgetful", kwargs={"part": part}, in_process=True, tolerated=0.0)
     copies = started(env)
     where = ", in copy 0 at step 1 of the episode with seed 0: "
     with pytest.raises(EnvironmentFailure, match=told + where + fix):
@@ -269,6 +279,177 @@ def test_the_delayed_variant_pays_agents_at_the_end():
     assert steps[-1].rewards["local"][0].tolist() == [0, 0]
     assert steps[1].active is not None
     assert steps[1].active[1].tolist() == [True, False]
+
+
+def alone(name, **fields):
+    return PettingZoo(f"broken_team:{name}", in_process=True, tolerated=0.0, **fields)
+
+
+def one(env, steps=3):
+    copies = started(env)
+    return [copies.step(np.ones((1, 2, env.action_size)), everyone(copies)) for _ in range(steps)]
+
+
+class TestNamedRewards:
+    def test_those_of_the_infos_are_found_and_read(self):
+        env = alone("Named")
+        assert env.signals == ("global", "local", "dense")
+        assert env.reward_shapes == {"global": (), "local": (2,), "dense": (2,)}
+        assert env.reported == "global"
+        steps = one(env)
+        assert [step.rewards["global"][0] for step in steps] == [1.0, 2.0, 3.0]
+        assert steps[0].rewards["dense"].tolist() == [[0.0, 10.0]]
+        assert steps[0].rewards["local"].tolist() == [[5.0, 1.0]]  # the environment's own
+
+    def test_a_worker_says_the_same(self):
+        here, there = alone("Named"), PettingZoo("broken_team:Named")
+        assert here.signals == there.signals
+        for a, b in zip(one(here), one(there), strict=True):
+            assert {k: v.tolist() for k, v in a.rewards.items()} == {
+                k: v.tolist() for k, v in b.rewards.items()
+            }
+
+    def test_who_left_earns_nothing_more(self):
+        env = alone("Named", kwargs={"leave": (("a", 1, "terminated"),)})
+        first, second, _ = one(env)
+        assert (first.rewards["global"][0], second.rewards["global"][0]) == (1.0, 2.0)
+        assert second.rewards["local"].tolist() == [[0.0, 1.0]]
+
+    def test_what_all_share_one_may_say(self):
+        assert [x.rewards["global"][0] for x in one(alone("Named", kwargs={"wrong": "one"}))] == [
+            1.0,
+            2.0,
+            3.0,
+        ]
+
+    @pytest.mark.parametrize(
+        ("wrong", "told"),
+        [
+            ("differ", "returned the reward 'global' as 2.0 and, of 'b', as 7.0"),
+            ("silent", r"returned no info\['rewards'\] of 'b'"),
+            ("private", "returned no reward 'dense' in the info of 'b'"),
+            ("new", "names the reward 'other', which its first step did not"),
+            ("nobody", "returned no reward 'global' in any info"),
+            ("text", "returned the reward '1.0'"),
+        ],
+    )
+    def test_a_missing_or_contradictory_reward_is_named(self, wrong, told):
+        with pytest.raises(EnvironmentFailure, match=f"Named {told}, in copy 0 at step 2"):
+            one(alone("Named", kwargs={"wrong": wrong}))
+
+    def test_names_that_come_late_are_named(self):
+        with pytest.raises(EnvironmentFailure, match=r"rewards in an info, .*at step 2"):
+            one(alone("Late"))
+
+    def test_shared_says_what_is_one_number(self):
+        env = alone("Named", shared=())
+        assert env.reward_shapes["global"] == (2,)
+        assert one(env)[1].rewards["global"].tolist() == [[2.0, 2.0]]
+
+    def test_functions_pay(self):
+        rewards = {"global": broken_team.arrived, "local": broken_team.each, "own": _pay_own}
+        env = PettingZoo("broken_team:Pair", max_episode_steps=4, rewards=rewards)
+        assert env.rewards[0] == ("global", "broken_team:arrived")
+        assert env.foreign_code == "broken_team:Pair"
+        assert PettingZoo("mpe2.simple_spread_v3", rewards=env.rewards).foreign_code is not None
+        assert env == PettingZoo("broken_team:Pair", rewards=env.rewards, max_episode_steps=4)
+        steps = one(env)
+        assert [step.rewards["global"][0] for step in steps] == [100.0, 200.0, 300.0]
+        assert steps[0].rewards["local"].tolist() == [[5.5, 1.5]]
+        assert (env.signals[2], steps[0].rewards["own"].tolist()) == ("own", [6.0])
+
+    def test_a_function_that_changes_its_mind_is_named(self):
+        env = alone("Limited", rewards={"global": "broken_team:fickle"})
+        with pytest.raises(EnvironmentFailure, match=r"was paid 'global' as a dict, .*at step 2"):
+            one(env)
+
+    def test_a_function_of_no_module_needs_this_process(self):
+        pay = {"global": lambda env, rewards, infos: 2.5}
+        with pytest.raises(ValueError, match="'global' cannot be imported by a worker: define"):
+            PettingZoo("broken_team:Limited", rewards=pay)
+        assert one(alone("Limited", rewards=pay))[0].rewards["global"].tolist() == [2.5]
+        with pytest.raises(ValueError, match="give a class, a plain Python function"):
+            alone("Limited", rewards={"global": 3.0})
+
+    def test_what_is_no_function_is_never_called(self, tmp_path):
+        env = alone("Limited", rewards={"global": "os:system"})
+        with pytest.raises(EnvironmentFailure, match="is a builtin_function_or_method"):
+            _ = env.signals
+
+
+def _pay_own(env, rewards, infos):
+    return sum(rewards.values())
+
+
+def test_our_own_teams_come_back_with_all_their_rewards():
+    env = PettingZoo(f"{__name__}:ours", in_process=True)
+    assert env.reward_shapes == {"global": (), "local": (2,)}
+    copies, task = started(env), Meet()
+    episode = int(np.random.default_rng(0).integers(2**31))
+    state, _ = task.reset(key=jax.random.split(jax.random.key(episode))[0])
+    for _ in range(4):
+        action = np.float32([[1.0], [-0.9]])
+        state, now = task.step(state, action, key=jax.random.key(0))
+        told = copies.step(action[None], everyone(copies)).rewards
+        np.testing.assert_allclose(told["local"][0], now.rewards["local"], atol=1e-6)
+        assert told["global"][0] == now.rewards["global"]
+
+
+def ours():
+    env = to_pettingzoo(Meet())
+    env.max_cycles = 5  # pyright: ignore[reportAttributeAccessIssue]
+    return env
+
+
+@pytest.mark.parametrize(("how", "ended"), [("terminated", [True, False]), ("cut", [False, False])])
+def test_an_agents_own_end_is_recorded(how, ended):
+    """Its termination ends its value and no other's; its truncation bootstraps."""
+    env = alone("Dies", kwargs={"how": how})
+    policy = Team(sharing="nothing", head=MLP(hidden=())).init(2, 1, 2, key=jax.random.key(0))
+    _, experience = rollout.collect(env, tree.stack(policy), 1, key=jax.random.key(1))
+    rows = experience.transitions
+    assert rows.terminated.tolist() == [ended, *[[False, False]] * 3]
+    assert rows.truncated.tolist() == [False] * 3 + [True]
+    assert rows.active.tolist() == [[True, True], *[[False, True]] * 3]
+    blank = rollout.blank(env)
+    assert (blank.terminated.shape, blank.truncated.shape) == ((2,), ())
+
+
+def test_the_value_of_an_agent_that_ends_is_its_last_reward():
+    """γ = 0.9: 1 for `a`, which ends, and r + γ·Q for `b`, for whom all goes on."""
+    learner = TD3(critic=Critic(hidden=(2,)), gamma=0.9, target_noise=0.0)
+    network = Team(sharing="nothing", head=MLP(hidden=()))
+    state = learner.init(network, 2, 1, 2, key=jax.random.key(0))
+    row = rollout.blank(alone("Dies"))
+    row = eqx.tree_at(lambda x: x.terminated, row, jnp.array([True, False]))
+    row = eqx.tree_at(lambda x: x.rewards["local"], row, jnp.array([1.0, 0.0]))
+    replay = extend(Replay.empty(row, 1), jax.tree.map(lambda x: x[None], row), jnp.ones(1, bool))
+    for together in (False, True):
+        rows = replay.sample(3, together=together, key=jax.random.key(0))
+        ends = (rows.terminated, rows.truncated, rows.active)
+        batch = Batch(rows.obs, rows.action, rows.rewards["local"], rows.next_obs, *ends)
+        target = learner.bellman_target(state, batch, key=jax.random.key(0))
+        assert target[:, 0].tolist() == [1.0, 1.0, 1.0]
+        assert (np.abs(np.asarray(target[:, 1])) > 0).all()
+
+
+class Mortal(Meet):
+    """Agent 0 ends for itself at its first step."""
+
+    def _time_step(self, state, local, met):
+        told = super()._time_step(state, local, met)
+        gone = jnp.array([True, False]) & (state.step == 1)
+        return dataclasses.replace(told, gone=gone)
+
+
+def test_an_agents_own_end_in_jax():
+    env = delayed(Mortal())
+    policy = Team(sharing="nothing", head=MLP(hidden=())).init(2, 1, 2, key=jax.random.key(0))
+    _, experience = rollout.collect(env, tree.stack(policy), 1, key=jax.random.key(1))
+    ended = experience.transitions.terminated
+    assert (ended.shape, ended[0].tolist()) == ((5, 2), [True, False])
+    assert rollout.blank(env).terminated.shape == (2,)
+    assert rollout.blank(Meet()).terminated.shape == ()  # as it always was
 
 
 def test_configs_are_compared_by_value():

@@ -104,7 +104,10 @@ class Single:
         self.said[i] = obs
         self._write(obs, frame.obs[i])
         frame.rewards["reward"][i] = reward if isinstance(reward, (float, int)) else _number(reward)
-        terminated, truncated = _flag("terminated", terminated), _flag("truncated", truncated)
+        if terminated is not True and terminated is not False:
+            terminated = _flag("terminated", terminated)
+        if truncated is not True and truncated is not False:
+            truncated = _flag("truncated", truncated)
         frame.terminated[i], frame.truncated[i] = terminated, truncated
         over = terminated or truncated
         if self.discrete and not over:
@@ -114,9 +117,10 @@ class Single:
     def _allow(self, obs: Any, info: Any, i: int) -> None:
         """Remember what copy `i` allows next, as far as it says."""
         says = obs if self._seen else info
-        mask = says.get("action_mask") if isinstance(says, Mapping) else None
+        mask = says.get("action_mask") if isinstance(says, dict) else None
         if mask is None:
-            self._masks.pop(i, None)
+            if self._masks:
+                self._masks.pop(i, None)
             return
         mask = np.asarray(mask)
         if mask.shape != (self.action_size,) or mask.dtype.kind not in "biu":
@@ -360,9 +364,9 @@ NAMED = (
 
 def _named(infos: Any, agent: str) -> Mapping[str, Any] | None:
     """`info["rewards"]` of one agent, if it has such a dict."""
-    info = infos.get(agent) if isinstance(infos, Mapping) else None
-    said = info.get("rewards") if isinstance(info, Mapping) else None
-    return said if isinstance(said, Mapping) else None
+    info = infos.get(agent) if isinstance(infos, dict) else None
+    said = info.get("rewards") if isinstance(info, dict) else None
+    return said if isinstance(said, dict) else None
 
 
 def _called(id: str, kwargs: dict[str, Any], kind: type) -> Any:
@@ -385,6 +389,8 @@ def _called(id: str, kwargs: dict[str, Any], kind: type) -> Any:
 
 def _said(what: str, said: Any, name: str) -> Any:
     """What is said of one agent."""
+    if isinstance(said, dict) and name in said:
+        return said[name]
     if not isinstance(said, Mapping):
         raise Fault(f"returned {what}s in a {type(said).__name__}", "return a dict by agent")
     if name not in said:
@@ -460,7 +466,7 @@ class _Flat(NamedTuple):
 
 def _flat(space: gymnasium.Space, said: str = "an observation") -> _Flat:
     spaces = gymnasium.spaces
-    if not space.is_np_flattenable:
+    if not (isinstance(space, gymnasium.Space) and space.is_np_flattenable):
         raise Fault(
             f"has the observation space {space}",
             "use a Box, a Discrete, or a Dict or Tuple of them",
@@ -483,8 +489,9 @@ def _flat(space: gymnasium.Space, said: str = "an observation") -> _Flat:
             )
         row[:] = spaces.flatten(space, obs)
 
-    size = spaces.flatdim(space)
-    return _Flat(size, "float32", np.zeros(size), np.ones(size), write_other)
+    size, hot = spaces.flatdim(space), not isinstance(space, spaces.Text)
+    low, high = (0.0, 1.0) if hot else (-np.inf, np.inf)
+    return _Flat(size, "float32", np.full(size, low), np.full(size, high), write_other)
 
 
 def _box_writer(space: Any, said: str) -> Callable[[Any, np.ndarray], None]:
@@ -523,7 +530,7 @@ def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
 
     def write(obs: Any, row: np.ndarray) -> None:
         if not isinstance(obs, kind) or len(obs) != len(writes):
-            told = f"the keys {list(obs)}" if isinstance(obs, Mapping) else type(obs).__name__
+            told = f"the keys {list(obs)}" if isinstance(obs, Mapping) else _kind(obs)
             raise Fault(
                 f"returned {said} of {told}",
                 f"its observation_space says {list(parts)}: make the two agree",
@@ -538,9 +545,15 @@ def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
 
     small = all(flat.dtype == "uint8" for flat in flats.values())
     low, high = (
-        np.concatenate([np.zeros(0), *(flat[k] for flat in flats.values())]) for k in (2, 3)
+        np.concatenate([np.zeros(0), *bounds])
+        for bounds in ([x.low for x in flats.values()], [x.high for x in flats.values()])
     )
     return _Flat(at, "uint8" if small and flats else "float32", low, high, write)
+
+
+def _kind(x: Any) -> str:
+    length = f" and length {len(x)}" if isinstance(x, (tuple, list)) else ""
+    return f"type {type(x).__name__}{length}"
 
 
 def _padded(flat: _Flat, size: int) -> list[Any]:
@@ -599,6 +612,8 @@ def _count(result: Any, n: int, where: str, parts: str) -> None:
 
 def _number(reward: Any) -> float:
     """A real number of whatever type, no string among them."""
+    if isinstance(reward, (float, int)):
+        return reward
     told = np.asarray(reward)
     if told.shape != () or told.dtype.kind not in "fuib":
         raise Fault(f"returned the reward {reward!r}", "return one number")

@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import WrapperSpec
 
 OWN_TEAMS = ("pettingzoo.", "mpe2.")  # modules of teams that are nobody's own code
 ALONE = "name the module, as in mine:{}, or set in_process=True"
@@ -213,9 +214,7 @@ def registered(id: str) -> dict[str, Any] | None:
         "kwargs": spec.kwargs,
         "max_episode_steps": spec.max_episode_steps,
         "order_enforce": spec.order_enforce,
-        "additional_wrappers": [
-            [w.name, w.entry_point, w.kwargs] for w in spec.additional_wrappers
-        ],
+        "additional_wrappers": [dataclasses.astuple(x) for x in spec.additional_wrappers],
     }
     if entry is None or here_alone(entry) or not _json(told):
         return {"id": spec.id, "entry_point": None}
@@ -231,9 +230,7 @@ def register(told: dict[str, Any] | None) -> None:
         return
     if told["entry_point"] is None:
         raise Fault("is registered in the process of the script alone", ALONE.format(told["id"]))
-    wrappers = [
-        gymnasium.envs.registration.WrapperSpec(*spec) for spec in told["additional_wrappers"]
-    ]
+    wrappers = [WrapperSpec(*spec) for spec in told["additional_wrappers"]]
     gymnasium.register(**{**told, "additional_wrappers": tuple(wrappers)})
 
 
