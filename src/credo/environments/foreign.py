@@ -183,6 +183,7 @@ class ForeignCopies(AbstractCopies):
         self._running = np.zeros(n, bool)  # in an episode
         self._stranded = np.zeros(n, bool)  # in one that was lost with the worker
         self._broken = np.zeros(n, bool)  # whose episode has failed
+        self._hurt = False  # whether there are any such: else a step costs less
         self._recent: collections.deque[str] = collections.deque(maxlen=100)  # why it failed, or ""
         self._whys: dict[int, str] = {}
         self._backend: worker.Environments | worker.Process | None = None
@@ -223,15 +224,15 @@ class ForeignCopies(AbstractCopies):
         np.copyto(self._seeds, seeds, where=active)
         self._steps[active], self._stranded[active], self._broken[active] = 0, False, False
         self._running |= active
+        self._hurt = self._hurt and bool((self._stranded | self._broken).any())
         frame, self.failed = self._call("reset", seeds, active)
         return frame.obs
 
     def step(self, actions: np.ndarray, active: np.ndarray) -> HostStep:
         actions = _form(actions, self._actions, np.float32)
         active = _form(active, (self.n,), np.bool_)
-        over = active & self._broken
-        if over.any():  # whoever asked takes no notice of `failed`
-            raise EnvironmentFailure(self.failure_text(int(over.argmax())))
+        if self._hurt and (active & self._broken).any():  # whoever asked did not look at `failed`
+            raise EnvironmentFailure(self.failure_text(int((active & self._broken).argmax())))
         self._steps += active
         frame, failed = self._call("step", actions, active)
         ended = frame.terminated | frame.truncated
@@ -250,10 +251,10 @@ class ForeignCopies(AbstractCopies):
             raise EnvironmentFailure(
                 f"{self._env.id}: these copies are closed: ask for copies(n) again"
             )
-        failed = active & self._stranded
+        failed = active & self._stranded if self._hurt else None
         while True:
             backend = self._opened()
-            asked, frame, faults = active & ~failed, None, {}
+            asked, frame, faults = active if failed is None else active & ~failed, None, {}
             try:
                 frame = getattr(backend, name)(numbers, asked)
                 faults = frame.faults
@@ -267,12 +268,15 @@ class ForeignCopies(AbstractCopies):
                 self._failed(name, faults)
             if frame is not None:
                 break
-            failed |= self._lost(name, asked, backend)
-        if failed.any() or faults:
-            failed |= frame.failed
-            self._running &= ~failed
-            self._stranded &= ~failed
-            self._broken |= failed
+            gone = self._lost(name, asked, backend)
+            failed = gone if failed is None else failed | gone
+        if failed is None and not faults:
+            return frame, frame.failed
+        failed = frame.failed if failed is None else failed | frame.failed
+        self._running &= ~failed
+        self._stranded &= ~failed
+        self._broken |= failed
+        self._hurt = True
         return frame, failed
 
     def _lost(self, name: str, asked: np.ndarray, backend: Any) -> np.ndarray:
@@ -281,6 +285,7 @@ class ForeignCopies(AbstractCopies):
         culprit = np.arange(self.n) == backend.current[0]
         gone = asked & culprit if name == "reset" else asked
         self._stranded |= self._running & ~asked
+        self._hurt = True
         self._finalizer.detach()
         self._backend = None
         backend.close(0.0)
