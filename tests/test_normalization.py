@@ -224,4 +224,4 @@ def test_raw_units_are_learned_with_it_and_not_without(on):
     step = jax.jit(lambda state, key: evolution.generation(state, key=key))
     for g in range(25):
         state, metrics = step(state, jax.random.key(g))
-    assert (float(metrics["champion_score"]) > -1.0) == on
+    assert (float(metrics["champion_score"]) > -2.5) == on
