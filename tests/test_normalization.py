@@ -161,6 +161,17 @@ def test_the_champion_is_frozen_and_the_state_goes_on(runs):
     assert algorithm.env.agents or abs(float(states[3].moments.mean[0]) - 5000) < 500
 
 
+def test_a_generation_has_at_most_the_frames_that_it_says(runs):
+    """In `Copy` every episode lasts until the clock ends it."""
+    algorithm, states, _ = runs
+    if not hasattr(algorithm, "replay_capacity"):
+        pytest.skip("has no buffer that the budget could fill")
+    if algorithm.env.agents is None:
+        assert int(states[1].frames) == algorithm.most_frames
+    else:
+        assert 0 < int(states[1].frames) <= algorithm.most_frames
+
+
 def test_a_state_read_back_goes_on_to_the_same_bits(runs, tmp_path):
     algorithm, states, step = runs
     eqx.tree_serialise_leaves(tmp_path / "state", states[2])
@@ -213,4 +224,4 @@ def test_raw_units_are_learned_with_it_and_not_without(on):
     step = jax.jit(lambda state, key: evolution.generation(state, key=key))
     for g in range(25):
         state, metrics = step(state, jax.random.key(g))
-    assert (float(metrics["champion_score"]) > -1.0) == on
+    assert (float(metrics["champion_score"]) > -2.5) == on

@@ -143,11 +143,13 @@ def test_samples_are_uniform_over_the_filled_rows(written):
 
 
 def test_too_little_memory_is_told_with_both_numbers(monkeypatch):
-    assert replay.row_bytes(ROW) == 8 + 4 + 4 + 4 + 8 + 1 + 1
-    monkeypatch.setattr(replay, "_memory", lambda: 3.0e9)
-    with pytest.raises(ValueError, match=r"200,000,000.*6\.0 GB.*3\.0 GB.*at most 100,000,000"):
+    assert replay.row_bytes(ROW) == 8 + 4 + 4 + 4 + 8 + 1 + 1 + 8  # the largest twice
+    monkeypatch.setattr(replay, "_free", lambda: 3_000_000_000)
+    said = r"200,000,000.*7,600,000,000 bytes.*3,000,000,000 more.*at most 78,947,368"
+    with pytest.raises(ValueError, match=said):
         Replay.empty(ROW, 200_000_000)
-    monkeypatch.setattr(replay, "_memory", lambda: 30.0 * CAPACITY)
+    monkeypatch.setattr(replay, "SMALL", 0)
+    monkeypatch.setattr(replay, "_free", lambda: 38 * CAPACITY)
     assert Replay.empty(ROW, CAPACITY).capacity == CAPACITY
     with pytest.raises(ValueError, match="at most 5"):
         Replay.empty(ROW, CAPACITY + 1)
@@ -157,7 +159,8 @@ def test_too_little_memory_is_told_with_both_numbers(monkeypatch):
 
 def test_shapes_alone_need_no_memory(monkeypatch):
     """A policy can be read where its run's buffer would not fit."""
-    monkeypatch.setattr(replay, "_memory", lambda: 1.0)
+    monkeypatch.setattr(replay, "SMALL", 0)
+    monkeypatch.setattr(replay, "_free", lambda: 1)
     with replay.shapes_alone():
         shapes = eqx.filter_eval_shape(lambda: Replay.empty(ROW, 1000))
     assert shapes.data.obs.shape[0] == 1000

@@ -62,7 +62,8 @@ def float32() -> Iterator[None]:
 
     What a task in JAX computes between `reset` and the end of an episode has 32 bits too.
     """
-    with jax.enable_x64(False) if jax.config.jax_enable_x64 else contextlib.nullcontext():
+    wide = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    with jax.enable_x64(False) if wide else contextlib.nullcontext():
         yield
 
 

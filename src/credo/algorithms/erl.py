@@ -289,7 +289,7 @@ def begin(hybrid: Hybrid, *, key: PRNGKeyArray) -> ERLState:
         frozen(moments, tree.take(population, 0)),
         jnp.float32(-jnp.inf),  # never tested
         *(jnp.int32(0) for _ in range(3)),
-        moments,
+        moments=moments,
     )
 
 

@@ -201,7 +201,7 @@ def improve(
     networks: tuple[Actor, CriticNetwork],
     optimizer: optax.OptState,
     replay: Replay,
-    moments: Moments | None,
+    moments: Moments | None = None,
     *,
     key: PRNGKeyArray,
 ) -> tuple[Actor, CriticNetwork, optax.OptState, Metrics]:

@@ -134,8 +134,8 @@ class TD3(AbstractLearner):
             moving = jax.lax.cond(due, move_policy, lambda: moving)
         else:
             moving = move_policy()
-        after = (moving[0], critics, *moving[1:], critic_opt, state.step + 1)
-        return TD3State(*after, state.agents), {"critic_loss": critic_loss, "q": q}
+        after: Any = (moving[0], critics, *moving[1:], critic_opt, state.step + 1, state.agents)
+        return TD3State(*after), {"critic_loss": critic_loss, "q": q}
 
     def bellman_target(
         self, state: TD3State, batch: Batch, *, key: PRNGKeyArray
