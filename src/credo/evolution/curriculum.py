@@ -6,6 +6,7 @@ from jaxtyping import Array, Float, Int
 
 from .. import require
 from ..environments.base import AbstractEnvironment, AbstractSequenceTask
+from ..environments.host import AbstractHostEnvironment
 from ..environments.wrappers import Shortened
 
 
@@ -23,7 +24,9 @@ class Curriculum(eqx.Module):
         require.at_least("start", self.start, 1)
         require.within("threshold", self.threshold, 0, 1)
 
-    def task(self, env: AbstractEnvironment, level: Int[Array, ""]) -> Shortened:
+    def task(
+        self, env: AbstractEnvironment | AbstractHostEnvironment, level: Int[Array, ""]
+    ) -> Shortened:
         """What is played at this level, where `env` is the algorithm's task."""
         env = env if self.whole is None else self.whole
         if not isinstance(env, AbstractSequenceTask):
