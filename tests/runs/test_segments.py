@@ -495,3 +495,18 @@ def test_only_what_is_written_is_needed(tmp_path, monkeypatch):
 def test_eqx_filter_of_a_state_keeps_the_buffer_in_parts(tmp_path):
     folder = save(tmp_path, 1, eqx.filter(filled(15) | {"name": "kept"}, eqx.is_array), {})
     assert ranges(folder) == [(0, 10), (10, 15)]
+
+
+@pytest.mark.parametrize("written", [15, 55])
+def test_a_buffer_of_an_older_form_is_read_in_todays(tmp_path, written):
+    """One end for a whole team is every agent's; bytes that were kept as floats are bytes again."""
+
+    def state(done, images):
+        rows = {"done": done, "images": images}
+        return {"buffer": Replay(rows, jnp.int32(written))}
+
+    old = filled(written)["buffer"].data["done"]
+    images = jnp.where(jnp.arange(CAPACITY) < written, jnp.arange(CAPACITY), 0)
+    save(tmp_path, 1, state(old, jnp.float32(images)), {})
+    new = state(jnp.broadcast_to(old[:, None], (CAPACITY, 3)), images.astype(jnp.uint8))
+    assert_same(load(tmp_path, like(new)).state, new)

@@ -331,7 +331,7 @@ def _fit(
         arrays.pop(name, None)
     for name, data in arrays.items():
         if isinstance(data, segments.Stored) and name in wanted:
-            arrays[name] = data.fitted(wanted[name].shape)
+            arrays[name] = data.fitted(wanted[name].shape, wanted[name].dtype)
     found = {}
     for name, data in arrays.items():
         wrap = functools.partial(jax.random.wrap_key_data, impl=keys.get(name))

@@ -111,24 +111,37 @@ class Stored(NamedTuple):
     dtype: np.dtype
     shape: tuple[int, ...]
     parts: list[tuple[int, int, Path]]
+    old: tuple[np.dtype, tuple[int, ...]] | None = None  # type and shape of a row on disk, if others
 
-    def fitted(self, shape: tuple[int, ...]) -> "Stored":
-        """The same rows in a buffer of another capacity, if it was never full and they fit."""
-        written = max((stop for _, stop, _ in self.parts), default=0)
-        if self.shape[1:] != shape[1:] or written > min(self.shape[0], shape[0]):
+    def fitted(self, shape: tuple[int, ...], dtype: np.dtype) -> "Stored":
+        """The same rows in a buffer of another capacity, if it was never full and they fit; and in
+        today's form, if an older version wrote them: one end for a whole team, which is each
+        agent's, and bytes as floats."""
+        written, row = max((stop for _, stop, _ in self.parts), default=0), self.shape[1:]
+        shared = self.dtype == np.bool_ and row == () and len(shape) == 2
+        whole = self.dtype == np.float32 and dtype == np.uint8 and row == shape[1:]
+        changed = (shared and dtype == self.dtype) or whole
+        if not changed and row != shape[1:]:
             return self
-        return self._replace(shape=tuple(shape))
+        if self.shape[0] != shape[0] and written > min(self.shape[0], shape[0]):
+            return self
+        if not changed:
+            return self._replace(shape=tuple(shape))
+        return self._replace(shape=tuple(shape), dtype=dtype, old=(self.dtype, row))
 
     def read(self) -> np.ndarray:
         """The whole leaf; rows never written are zero. Raises what `safetensors` raises, and
         `ValueError` if a part is not what its name says."""
         whole, capacity = np.zeros(self.shape, self.dtype), self.shape[0]
+        dtype, row = self.old or (self.dtype, self.shape[1:])
         for start, stop, path in self.parts:
             with safe_open(path, framework="numpy") as file:
                 rows = file.get_tensor(self.name)
-            expected = (stop - start, *self.shape[1:])
-            if rows.dtype != self.dtype or rows.shape != expected or stop - start > capacity:
+            if rows.dtype != dtype or rows.shape != (stop - start, *row) or len(rows) > capacity:
                 raise ValueError(f"{self.name} in {path.name} is {rows.dtype}{list(rows.shape)}")
+            if self.old is not None:
+                rows = rows if len(self.shape) == 1 + len(row) else rows[:, None]
+                rows = rows.astype(self.dtype)
             slot = start % capacity
             n = min(len(rows), capacity - slot)
             whole[slot : slot + n] = rows[:n]
