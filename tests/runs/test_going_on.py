@@ -156,9 +156,7 @@ def test_weights_that_are_no_numbers_end_the_run(tmp_path, monkeypatch, what, va
 
     monkeypatch.setattr(loop, "play", spoiled)
     words = {"learner": "the actor of the learner", "champion": "the champion"}[what]
-    with pytest.raises(
-        loop.RunError, match=rf"weights of .*{words}.* are not finite after"
-    ):
+    with pytest.raises(loop.RunError, match=rf"weights of .*{words}.* are not finite after"):
         train(tmp_path / "run", checkpoint_every=0.0)
     monkeypatch.undo()
     newest = max((tmp_path / "run" / "checkpoints").glob("[0-9]*"))
