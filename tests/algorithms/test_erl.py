@@ -21,6 +21,7 @@ from credo.learners.manager import UCB
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3
 from credo.networks.mlp import MLP, Critic
+from credo.types import NOTHING
 
 K, E = 6, 2
 LEARNER = TD3(critic=Critic(hidden=(3,)), actor_lr=0.01, critic_lr=0.01, batch_size=4)
@@ -124,7 +125,7 @@ def test_learning_waits_for_the_warm_up_and_makes_its_share_of_updates(erl):
     assert [row["updates"] > 0 for row in rows[:4]] == [False, False, True, True]
     for g, row in enumerate(rows, start=1):
         assert same(states[g].learners, states[g - 1].learners) == (row["updates"] == 0)
-        assert np.isnan(row["critic_loss_0"]) == (row["updates"] == 0)
+        assert (row["critic_loss_0"] == NOTHING) == (row["updates"] == 0)
         assert int(states[g].frames) == frames[:g].sum()
         assert row["episodes"] == int(states[g].episodes) == 7 * g
         assert int(states[g].generation) == g
