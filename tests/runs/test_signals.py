@@ -105,7 +105,7 @@ class Broken(io.StringIO):
 ERRORS = [BrokenPipeError(32, "no"), OSError(5, "no"), OSError(28, "no"), ValueError("closed")]
 
 
-@pytest.mark.parametrize("stream", [*map(Broken, ERRORS), None], ids=repr)
+@pytest.mark.parametrize("stream", [*map(Broken, ERRORS), None], ids=[*map(repr, ERRORS), "none"])
 def test_no_word_raises_into_training(stream, monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setattr(sys, "stdout", stream)

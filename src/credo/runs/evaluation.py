@@ -11,6 +11,7 @@ from jaxtyping import PRNGKeyArray
 
 from .. import tree
 from ..analysis import counting, floors
+from ..compilation import float32
 from ..environments.host import AbstractHostEnvironment
 from ..environments.sequence_classification import SequenceClassification
 from ..rollout import evaluate
@@ -49,6 +50,7 @@ class Result(NamedTuple):
     steps: float  # in an episode, on average
 
 
+@float32()
 def played(run: Run, task: Any, episodes: int | None, seed: int) -> Result:
     """Fresh episodes of a run's champion on `task`, which may differ from the one it was trained
     on. `episodes`: None for `EPISODES`, or `HOST_EPISODES` of a task outside JAX."""

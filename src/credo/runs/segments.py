@@ -111,7 +111,9 @@ class Stored(NamedTuple):
     dtype: np.dtype
     shape: tuple[int, ...]
     parts: list[tuple[int, int, Path]]
-    old: tuple[np.dtype, tuple[int, ...]] | None = None  # type and shape of a row on disk, if others
+    old: tuple[np.dtype, tuple[int, ...]] | None = (
+        None  # type and shape of a row on disk, if others
+    )
 
     def fitted(self, shape: tuple[int, ...], dtype: np.dtype) -> "Stored":
         """The same rows in a buffer of another capacity, if it was never full and they fit; and in

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from .. import require
+from ..compilation import float32
 from ..environments import worker
 from ..environments.extended_tmaze import ExtendedTMaze
 from ..environments.foreign import AbstractForeignEnvironment
@@ -32,6 +33,7 @@ STEPS = 30  # per second, where an environment does not say
 ROVER_STEPS = 5  # per second; in real time it would be one
 
 
+@float32()
 def watch(
     run: Run,
     output: str | pathlib.Path | None = None,
