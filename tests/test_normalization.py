@@ -18,6 +18,7 @@ from credo.algorithms.off_policy import OffPolicy
 from credo.algorithms.ppo import PPO
 from credo.environments.probes import Copy, Meet
 from credo.learners.td3 import TD3
+from credo.networks.dmmu import DMMU
 from credo.networks.mlp import MLP, Critic
 from credo.networks.normalized import LIMIT, Normalized, scaled
 from credo.networks.team import Team
@@ -225,3 +226,9 @@ def test_raw_units_are_learned_with_it_and_not_without(on):
     for g in range(25):
         state, metrics = step(state, jax.random.key(g))
     assert (float(metrics["champion_score"]) > -2.5) == on
+
+
+def test_a_network_that_reads_its_observations_last_number_is_refused():
+    with pytest.raises(ValueError, match="who takes part"):
+        Moments.first(Meet(), DMMU(hidden=3))
+    assert Moments.first(Meet(), DMMU(hidden=3, access="everyone")).mean.shape == (2, 2)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .compilation import jit
-from .networks.base import AbstractPolicy
+from .networks.base import AbstractNetwork, AbstractPolicy
 from .networks.normalized import Normalized, scaled
 from .replay import BLOCK
 from .rollout import Environment, Experience, collect, evaluate
@@ -33,8 +33,17 @@ class Moments(eqx.Module):
     variance: Float[Array, "*agents obs"]
 
     @classmethod
-    def first(cls, env: Environment) -> "Moments":
-        """Before anything was seen: mean 0, variance 1."""
+    def first(cls, env: Environment, network: AbstractNetwork | None = None) -> "Moments":
+        """Before anything was seen: mean 0, variance 1.
+
+        **Raises:** `ValueError` for a network that reads who takes part from an observation.
+        """
+        if getattr(network, "access", "everyone") != "everyone":
+            raise ValueError(
+                f"{type(network).__name__} reads from the last number of an observation who takes "
+                "part, which normalisation would change: give normalize_observations=False, or a "
+                "network with access='everyone' on a task without that number"
+            )
         obs_size, _, *team = env.sizes
         shape = (*team, obs_size)
         ones = jnp.ones(shape, jnp.float32)

@@ -248,6 +248,16 @@ def test_a_cut_metrics_file_is_named(finished):
         _ = loop.Run(finished).metrics
 
 
+def test_a_run_that_lost_its_metrics_does_not_begin_anew(finished):
+    for folder in (finished / "checkpoints").iterdir():
+        if folder.name not in ("00000000", "00000012"):
+            shutil.rmtree(folder)
+    (finished / "metrics.csv").unlink()
+    with pytest.raises(CheckpointError, match=r"metrics\.csv cannot be read"):
+        resume(finished, generations=14)
+    assert (finished / "checkpoints" / "00000012" / "COMMIT").exists()
+
+
 def test_the_clock_is_worth_no_run(finished):
     (finished / "timing.csv").write_bytes(b"generation,seconds\n1,\xff\xff\n")
     with pytest.warns(UserWarning, match=r"timing\.csv"):

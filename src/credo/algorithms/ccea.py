@@ -146,7 +146,7 @@ class CCEA(eqx.Module):
         keys = jax.random.split(key, self.agents)
         populations = eqx.filter_vmap(lambda key: self.new_population(key=key))(keys)
         first = jnp.zeros((self.agents, 1), jnp.int32)
-        moments = Moments.first(self.env) if self.normalize_observations else None
+        moments = Moments.first(self.env, self.network) if self.normalize_observations else None
         champion = frozen(moments, tree.take(drafted(self, populations, first), 0))
         return CCEAState(populations, champion, moments)
 

@@ -278,7 +278,7 @@ def begin(hybrid: Hybrid, *, key: PRNGKeyArray) -> ERLState:
     population = eqx.filter_vmap(lambda key: network.init(*env.sizes, key=key))(
         jax.random.split(population_key, k)
     )
-    moments = Moments.first(env) if hybrid.normalize_observations else None
+    moments = Moments.first(env, network) if hybrid.normalize_observations else None
     return ERLState(
         population,
         Lineage.first(k, q),

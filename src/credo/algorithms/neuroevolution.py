@@ -196,7 +196,7 @@ class Neuroevolution(eqx.Module):
         population = self.new_population(key=key)
         k = self.population_size
         level = jnp.int32(self.curriculum.start if self.curriculum else 0)
-        moments = Moments.first(self.env) if self.normalize_observations else None
+        moments = Moments.first(self.env, self.network) if self.normalize_observations else None
         champion = frozen(moments, tree.take(population, 0))
         record, age = jnp.zeros(k), jnp.zeros(k, jnp.int32)
         return NeuroevolutionState(population, champion, record, age, level, moments)

@@ -112,7 +112,7 @@ class OffPolicy(eqx.Module):
         require.continuous(env, self.learner)
         learner = self.learner.init(self.network, *env.sizes, key=key)
         replay = Replay.empty(blank(env), self.replay_capacity)
-        moments = Moments.first(env) if self.normalize_observations else None
+        moments = Moments.first(env, self.network) if self.normalize_observations else None
         actor = frozen(moments, self.learner.actor(learner))
         counted = (jnp.float32(-jnp.inf), jnp.int32(0), moments)
         return OffPolicyState(learner, replay, actor, *counted)

@@ -130,7 +130,7 @@ class PPO(eqx.Module):
         opt = adam_state((actor, critic))
         length = jnp.float32(min(self.horizon, env.max_steps))
         score = jnp.float32(-jnp.inf)
-        moments = Moments.first(env) if self.normalize_observations else None
+        moments = Moments.first(env, self.network) if self.normalize_observations else None
         rest = (score, length, jnp.int32(0), moments)
         return PPOState(actor, critic, opt, replay, frozen(moments, mean), *rest)
 

@@ -39,6 +39,7 @@ class Single:
     """
 
     agents: ClassVar[int | None] = None
+    names: ClassVar[None] = None
     signals: ClassVar[list[tuple[str, bool]]] = [("reward", False)]  # name, private to an agent
 
     @staticmethod
@@ -171,16 +172,16 @@ class Team:
     def __init__(self, env: Any, spec: dict[str, Any]):
         self.warnings = _lasting(env)
         self.max_steps = self._cycles(env, spec["max_episode_steps"])
-        self._names: list[str] = list(getattr(env, "possible_agents", ()))
-        if not self._names:
+        self.names: list[str] = list(getattr(env, "possible_agents", ()))
+        if not self.names:
             raise Fault("has no possible_agents", "name there every agent that an episode may have")
-        self.agents = len(self._names)
-        self._rows = {name: k for k, name in enumerate(self._names)}
-        for name in self._names:
+        self.agents = len(self.names)
+        self._rows = {name: k for k, name in enumerate(self.names)}
+        for name in self.names:
             _box(name, env.action_space(name))
-        flats = [_flat(env.observation_space(name)) for name in self._names]
-        actions = [_actions(env.action_space(name)) for name in self._names]
-        self.actions = [_described(env.action_space(name)) for name in self._names]
+        flats = [_flat(env.observation_space(name)) for name in self.names]
+        actions = [_actions(env.action_space(name)) for name in self.names]
+        self.actions = [_described(env.action_space(name)) for name in self.names]
         self.obs_size = max(flat.size for flat in flats)
         self.obs_dtype = "uint8" if all(x.dtype == "uint8" for x in flats) else "float32"
         self.obs_range = [_padded(flat, self.obs_size) for flat in flats]

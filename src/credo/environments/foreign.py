@@ -330,7 +330,7 @@ def _form(x: np.ndarray, shape: tuple[int, ...], dtype: type) -> np.ndarray:
     return x
 
 
-RECORDED = ("obs_size", "action_size", "agents", "discrete", "actions", "observations")
+RECORDED = ("obs_size", "action_size", "agents", "discrete", "actions", "observations", "names")
 _WARNED: set[AbstractForeignEnvironment] = set()
 
 

@@ -38,6 +38,7 @@ SIZES = (
     "signals",
     "actions",
     "observations",
+    "names",
     "obs_range",
     "warnings",
 )

@@ -371,8 +371,12 @@ def _load(run: Run, algorithm: Any, without_replay: bool = False) -> checkpoint.
         why = record.stranger(run.config, seals.get("record"))
         if why is None and "metrics" in seals:
             why = _unlike(run.path, seals["metrics"])
-        return why
+            lost.extend([why] if why else [])
+        # Some generations are soon trained again; a run whose checkpoints are whole never begins
+        # anew because another file was lost.
+        return lost[0] if why is None and generation == 0 and lost else why
 
+    lost: list[str] = []  # what is wrong with metrics.csv, by checkpoints that are whole
     like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0))
     like, static = eqx.partition(like, lambda x: isinstance(x, jax.ShapeDtypeStruct))
     saved = checkpoint.load(
@@ -558,6 +562,13 @@ def _warm(algorithm: Any, state: PyTree, source: Run) -> PyTree:
             source.part(name) or config.brief(source.config["algorithm"][name])
             for name in ("network", "env")
         ]
+        flag = "normalize_observations"
+        flags = [bool(source.config["algorithm"].get(flag)), getattr(algorithm, flag, False)]
+        if flags[0] != flags[1]:
+            raise RunError(
+                f"the champion of {source.path} was trained with {flag}={flags[0]}, and this run "
+                f"has {flag}={flags[1]}: give both the same"
+            ) from error
         raise RunError(
             f"the champion of {source.path} is {theirs[0]} on {theirs[1]}, and this run is "
             f"{algorithm.network} on {algorithm.env}: give the same --preset or --network, and a "
