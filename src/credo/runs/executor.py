@@ -115,10 +115,16 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
     queue, done, under_way = iter(list(waiting)), 0, list[Job]()
     guard = threading.Lock()
 
+    over = threading.Event()
+
+    def begun(core: int) -> subprocess.Popen | None:
+        with guard:  # none is started once all are ended
+            return None if over.is_set() or signals.received else _start(core)
+
     def work(core: int) -> None:
         nonlocal done
-        process = _start(core)
-        while not signals.received:
+        process = begun(core)
+        while process is not None and not signals.received:
             with guard:
                 job = next(queue, None)
                 if job is None:
@@ -133,11 +139,12 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
                 board.finished(job, done)
             if process.poll() is not None:
                 _end(process)
-                process = _start(core)
-        _end(process)
+                process = begun(core)
+        if process is not None:
+            _end(process)
 
     board = Board(title, len(jobs), len(waiting))
-    with _no_orphans(), Signals(quiet=False, end=_kill_all) as signals, board:
+    with _no_orphans(guard, over), Signals(quiet=False, end=_kill_all) as signals, board:
         threads = [
             threading.Thread(target=work, args=(cores[i % len(cores)],), daemon=True)
             for i in range(workers)
@@ -284,9 +291,12 @@ def _kill_all() -> None:
 
 
 @contextlib.contextmanager
-def _no_orphans() -> Iterator[None]:
-    """No worker is left, however the block ends: by an error or a second Ctrl-C too."""
+def _no_orphans(guard: threading.Lock, over: threading.Event) -> Iterator[None]:
+    """No worker is left, however the block ends: by an error or a second Ctrl-C too. `over`: that
+    it ended, told to whoever starts one."""
     try:
         yield
     finally:
+        with guard:
+            over.set()
         _kill_all()
