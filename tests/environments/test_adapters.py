@@ -175,6 +175,7 @@ def test_a_task_says_how_it_takes_actions():
         "discrete": True,
         "actions": {"n": 3, "start": 5},
         "observations": None,
+        "names": None,
     }
     numbered = here("Numbered").task_record()
     assert numbered["observations"] == {"n": 4, "start": -1}

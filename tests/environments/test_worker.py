@@ -363,7 +363,10 @@ UNFIT = {
     "unbounded": (tiny("Unbounded"), "action space without bounds.*: give its Box a finite low"),
     "other actions": (tiny("Asks"), r"action space MultiBinary\(3\): use a Box or a Discrete"),
     "no env": (tiny("NoEnv"), "is a NoEnv: name a class derived from gymnasium.Env"),
-    "unknown id": (Gymnasium("Hoper-v5"), "raised NameNotFound.*: look at its id and kwargs"),
+    "unknown id": (
+        Gymnasium("Hoper-v5"),
+        "unknown to Gymnasium here .*Did you mean: `Hopper`.*: look at the id",
+    ),
     "no package": (Gymnasium("nosuch:Env"), "raised ModuleNotFoundError.*: look at its id"),
     "wrong kwargs": (tiny(kwargs={"x": 1}), "raised TypeError.*unexpected keyword"),
     "unseeded": (tiny("Unseeded"), "same seed gave two different episodes: draw everything from"),

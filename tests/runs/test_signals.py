@@ -165,17 +165,14 @@ def test_whoever_stops_reading_loses_nothing(tmp_path, shell, stop):
     train = TRAIN.format(python=sys.executable, path=path)
     command = shell.format(train=train, log=tmp_path / "log")
 
-    def fresh():
-        for number in (signal.SIGINT, signal.SIGHUP):
-            signal.signal(number, signal.SIG_DFL)
-
+    # Not `preexec_fn`: it would fork this process, in which JAX has threads.
+    fresh = "import os, signal, sys; [signal.signal(n, signal.SIG_DFL) for n in (1, 2)]; "
     nothing = subprocess.DEVNULL
     process = subprocess.Popen(
-        ["bash", "-c", command],
+        [sys.executable, "-c", fresh + "os.execvp('bash', sys.argv[1:])", "bash", "-c", command],
         stdout=nothing,
         stderr=nothing,
         start_new_session=True,
-        preexec_fn=fresh,
     )
     try:
         deadline = time.monotonic() + 120

@@ -413,7 +413,14 @@ def _box(name: str, space: gymnasium.Space) -> None:
 def _registered(id: str, kwargs: dict[str, Any], max_episode_steps: int | None) -> gymnasium.Env:
     with warnings.catch_warnings():  # -v4 tasks are asked for on purpose
         warnings.filterwarnings("ignore", r".*is out of date", DeprecationWarning)
-        entry = gymnasium.spec(id).entry_point
+        try:
+            entry = gymnasium.spec(id).entry_point
+        except gymnasium.error.NameNotFound as error:
+            raise Fault(
+                f"is unknown to Gymnasium here ({error})",
+                "look at the id, and whether its package is installed; if a module registers it "
+                f"when it is imported, name that too, as in my_module:{id}",
+            ) from error
         if isinstance(entry, str):
             importlib.import_module(entry.partition(":")[0])
         _hear_mujoco()
