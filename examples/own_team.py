@@ -5,8 +5,9 @@
     credo train merl own_team:Carry --fitness global --learners.0.signal local
 
 Three agents find a box and carry it to the right. The box moves only while all three hold it. Each
-agent is paid for every step towards the box (`local`, dense); the team is paid once, at the end,
-for the share of the way that the box was carried (`global`, sparse).
+agent is paid for every step towards the box, less its effort (`local`, dense); the team is paid
+once, at the end, for the share of the way that the box was carried (`global`, sparse). Whoever
+follows the local reward alone finds the box and rests there.
 """
 
 import numpy as np
@@ -47,7 +48,7 @@ class Carry(ParallelEnv):
         self.places = np.clip(self.places + moves, -1.0, 1.0)
         self.steps += 1
         over = self.steps >= self.max_cycles
-        local = before - self._distances()
+        local = before - self._distances() - 2.0 * (moves**2).sum(axis=1)  # at most 0.1 - 0.04
         carried = (self.box[0] - self.start[0]) / (1.0 - self.start[0])
         rewards = {"global": float(max(carried, 0.0)) if over else 0.0}
         told = (
