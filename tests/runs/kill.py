@@ -155,7 +155,7 @@ def disturb(
     else:
         trains(process, run, before)
         time.sleep(rng.uniform(0.0, 0.5))
-    if process.poll() == 0:
+    if process.poll() == 0 or (process.poll() == 141 and how == "pipe"):
         raise SystemExit("the run reached its end before a disturbance: give more --generations")
     if process.poll() is not None:
         told = "" if how == "pipe" else os.read(reader, 100_000).decode()
@@ -227,6 +227,9 @@ def main() -> None:
     parser.add_argument("--generations", type=int, help="enough for 20 by default")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     arguments = parser.parse_args()
+    # Where this was started by `nohup` or in the background, its children would ignore them.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     names = list(TRAIN) if arguments.what == "all" else [arguments.what]
     how = HOW if arguments.how == "all" else (arguments.how,)
     times, failed = -(-arguments.times // len(names)), []
