@@ -1,13 +1,14 @@
-"""A team of your own: a PettingZoo environment that names its rewards.
+r"""A team of your own: a PettingZoo environment that names its rewards.
 
     cd examples
     credo check own_team:Carry
-    credo train merl own_team:Carry --fitness global --learners.0.signal local
+    credo train merl own_team:Carry --fitness global --learners.0.signal local \
+        --episodes 4 --workers 20 --frames 3e5
 
 Three agents find a box and carry it to the right. The box moves only while all three hold it. Each
-agent is paid for every step towards the box, less its effort (`local`, dense); the team is paid
-once, at the end, for the share of the way that the box was carried (`global`, sparse). Whoever
-follows the local reward alone finds the box and rests there.
+agent is paid for every step towards the box (`local`, dense); the team is paid once, at the end,
+for the share of the way that the box was carried (`global`, sparse). The local reward says where
+the box is and nothing about where it should go.
 """
 
 import numpy as np
@@ -48,7 +49,7 @@ class Carry(ParallelEnv):
         self.places = np.clip(self.places + moves, -1.0, 1.0)
         self.steps += 1
         over = self.steps >= self.max_cycles
-        local = before - self._distances() - 2.0 * (moves**2).sum(axis=1)  # at most 0.1 - 0.04
+        local = before - self._distances()
         carried = (self.box[0] - self.start[0]) / (1.0 - self.start[0])
         rewards = {"global": float(max(carried, 0.0)) if over else 0.0}
         told = (

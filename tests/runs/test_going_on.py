@@ -265,7 +265,7 @@ def test_the_clock_is_worth_no_run(finished):
     assert loop.Run(finished).metrics["generation"][-1] == 14
 
 
-# Seeds, sessions and folders.
+# Seeds, prompts and folders.
 
 
 @pytest.mark.parametrize("seed", [-1, 2**32, 1 << 70, 1.5, True])

@@ -213,9 +213,9 @@ def of_a_prompt(tree: Any) -> list[str]:
     if isinstance(tree, dict | list):
         values = tree.values() if isinstance(tree, dict) else tree
         return [name for value in values for name in of_a_prompt(value)]
-    session = isinstance(tree, str) and tree.startswith("__main__:")
+    prompt = isinstance(tree, str) and tree.startswith("__main__:")
     file = getattr(sys.modules.get("__main__"), "__file__", None)
-    return [tree.partition(":")[2]] if session and file is None else []
+    return [tree.partition(":")[2]] if prompt and file is None else []
 
 
 def find_class(name: str) -> type:
@@ -229,7 +229,7 @@ def find_class(name: str) -> type:
         if module == "__main__":
             raise ConfigError(
                 f"{attribute} was defined at a prompt or in a notebook and is known in that "
-                "session alone: put it into a file of its own, and import it from there"
+                "process alone: put it into a file of its own, and import it from there"
             ) from error
         raise NotFound(
             f"cannot find {name!r} ({error}): install its package, or start Python where its "

@@ -164,7 +164,7 @@ def train(
         said["resumable"] = False
         warnings.warn(
             f"{', '.join(prompt)} was defined at a prompt or in a notebook: this run can go on in "
-            "this session alone; put it into a file for one that can be resumed",
+            "this process alone; put it into a file for one that can be resumed",
             stacklevel=3,
         )
     if warm_start is not None:
