@@ -8,8 +8,8 @@
     warm_start  the run whose champion this one started from
     changes     what was changed on the way: budgets, settings
     resumable   false if a class was defined in a notebook
-    sha256      of all the others: it finds what was changed by hand or by a disk
     signature   of the user who made it (see `trust`)
+    sha256      of all the others: it finds what was changed by hand or by a disk
 
 Older versions wrote algorithm, seed, budget, machine and warm_start alone.
 """
@@ -23,7 +23,7 @@ from typing import Any
 
 from . import files, trust
 
-NAME, CHECKSUM = "config.json", "sha256"
+NAME = "config.json"
 SIZES = {
     "obs_size": "numbers in an observation",
     "action_size": "numbers in an action",
@@ -61,13 +61,19 @@ def read(folder: pathlib.Path) -> Record:
         raise RunError(f"{told}; restore it from a copy") from error
     if not isinstance(content, dict):
         raise RunError(f"{path} is damaged: it is no JSON object; restore it from a copy")
+    if unknown := sorted(set(content) - set(FIELDS)):
+        # A checksum under another name would protect nothing.
+        raise RunError(
+            f"{path} has an entry {unknown[0]!r}, which this version of Credo does not write: "
+            "restore it from a copy if it is damaged, or install the newer version that made it"
+        )
     for name, (right, what) in FIELDS.items():
         if name in content and not right(content[name]):
             raise RunError(
                 f"{path} is damaged: {name!r} is {_brief(content[name])}: it must be {what}; "
                 "restore it from a copy"
             )
-    if content.get(CHECKSUM, _checksum(content)) != _checksum(content):
+    if content.get(trust.CHECKSUM, _checksum(content)) != _checksum(content):
         raise RunError(
             f"{path} was changed after Credo wrote it (its checksum says so): restore it from a "
             "copy. The settings of a run are changed by `credo resume RUN --set NAME=VALUE`, its "
@@ -80,10 +86,10 @@ def read(folder: pathlib.Path) -> Record:
 
 def write(folder: pathlib.Path, record: dict[str, Any]) -> None:
     """Write config.json, with a checksum and this user's signature."""
-    said = {k: v for k, v in record.items() if k not in (CHECKSUM, trust.SIGNATURE)}
-    record = said | {CHECKSUM: _checksum(said)}
-    signature = trust.sign(record)
-    files.write_json(folder / NAME, record | ({trust.SIGNATURE: signature} if signature else {}))
+    said = {k: v for k, v in record.items() if k not in (trust.CHECKSUM, trust.SIGNATURE)}
+    if signature := trust.sign(said):
+        said |= {trust.SIGNATURE: signature}
+    files.write_json(folder / NAME, said | {trust.CHECKSUM: _checksum(said)})
 
 
 def stranger(record: Mapping[str, Any], sealed: Any) -> str | None:
@@ -158,8 +164,7 @@ def _count(size: int | None) -> str:
 
 
 def _checksum(content: dict[str, Any]) -> str:
-    left_out = (CHECKSUM, trust.SIGNATURE)
-    return trust.short({k: v for k, v in content.items() if k not in left_out})
+    return trust.short({k: v for k, v in content.items() if k != trust.CHECKSUM})
 
 
 def _brief(value: Any) -> str:
@@ -235,6 +240,6 @@ FIELDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "warm_start": (_is_text, "the path of a run"),
     "changes": (_is_changes, "a list of objects, each with a generation"),
     "resumable": (lambda value: isinstance(value, bool), "true or false"),
-    CHECKSUM: (_is_text, "a text"),
+    trust.CHECKSUM: (_is_text, "a text"),
     trust.SIGNATURE: (_is_text, "a text"),
 }

@@ -20,7 +20,7 @@ from typing import Any
 from . import files
 
 SIZE = 32  # bytes of a key
-SIGNATURE = "signature"
+SIGNATURE, CHECKSUM = "signature", "sha256"  # of a record; the second is of the first too
 
 
 def canonical(value: Any) -> bytes:
@@ -52,7 +52,7 @@ def digest(record: Mapping[str, Any]) -> str:
 
 
 def sign(record: Mapping[str, Any]) -> str | None:
-    """HMAC-SHA256 of all that a record says but its signature; None if there can be no key."""
+    """HMAC-SHA256 of all that a record says of its run; None if there can be no key."""
     key = _key(make=True)
     return None if key is None else _code(record, key)
 
@@ -78,7 +78,7 @@ def key_path() -> pathlib.Path | None:
 
 
 def _code(record: Mapping[str, Any], key: bytes) -> str:
-    said = {name: value for name, value in record.items() if name != SIGNATURE}
+    said = {k: v for k, v in record.items() if k not in (SIGNATURE, CHECKSUM)}
     return hmac.new(key, canonical(said), hashlib.sha256).hexdigest()
 
 
