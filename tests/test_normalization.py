@@ -232,3 +232,11 @@ def test_a_network_that_reads_its_observations_last_number_is_refused():
     with pytest.raises(ValueError, match="who takes part"):
         Moments.first(Meet(), DMMU(hidden=3))
     assert Moments.first(Meet(), DMMU(hidden=3, access="everyone")).mean.shape == (2, 2)
+
+
+def test_counts_do_not_overflow():
+    moments = Moments(jnp.int32(2**31 - 1000), jnp.full(1, 3.0), jnp.full(1, 4.0))
+    after = moments.after(experience(jnp.full((5000, 1), 3.5), np.ones(5000, bool)))
+    assert 0 < int(after.count) < 2**31
+    np.testing.assert_allclose(after.mean, 3.0, atol=1e-4)
+    np.testing.assert_allclose(after.variance, 4.0, rtol=1e-4)

@@ -684,6 +684,8 @@ def _task(name: str, settings: dict[str, dict[str, Any]]) -> Any:
         return _own_task(name, settings)
     if re.fullmatch(r"\w+(\.\w+)+", name):  # a module with parallel_env
         return _with_settings(_load(PETTINGZOO)(id=name), settings)
+    if match := re.fullmatch(r"(?:\./)?(\w+)\.py:(\w+)", name):  # a file in place of its module
+        fail(f"{name!r} names a file: name its module, {match[1]}:{match[2]}")
     import gymnasium
 
     module, _, registered = name.rpartition(":")

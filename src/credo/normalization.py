@@ -28,7 +28,7 @@ class Moments(eqx.Module):
     """Of every number of an observation; of a team for each agent apart, since the same number may
     mean something else to each. Agents that do not act are not counted."""
 
-    count: Int[Array, "*agents"]  # observations so far, below 2^31
+    count: Int[Array, "*agents"]  # observations so far, at most 2^30 and those of the last rollout
     mean: Float[Array, "*agents obs"]
     variance: Float[Array, "*agents obs"]
 
@@ -96,7 +96,8 @@ def _summary(obs: Any, valid: Any, active: Any, xp: Any) -> tuple[Any, Any, Any]
 def _merged(moments: Moments, n: Array, mean: Array, variance: Array) -> Moments:
     """With n more (Chan, Golub & LeVeque 1979). Shares in place of sums: those would outgrow
     float32."""
-    count = moments.count + n
+    # From 2^30 observations on the latest weigh as they did then: 32 bits would overflow.
+    count = jnp.minimum(moments.count, 2**30) + n
     share = (n.astype(jnp.float32) / jnp.maximum(count, 1).astype(jnp.float32))[..., None]
     away = mean - moments.mean
     spread = (1.0 - share) * moments.variance + share * variance

@@ -50,7 +50,10 @@ def continuous(env: Any, *learners: Any) -> None:
 def _other_team(env: Any, network: Any) -> str:
     task, name = getattr(env, "id", type(env).__name__), type(network).__name__
     if network.team:
-        return f"{name} acts for a team and {task} has one agent: give a network of one, MLP(...)"
+        return (
+            f"{name} acts for a team and {task} has one agent: give a network of one, MLP(...), to "
+            "an algorithm for one (erl, td3)"
+        )
     return (
         f"{name} acts for one agent and {task} has {env.agents}: put it on a team, as in "
         f"Team(head={name}(...))"

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from . import tree
 from .compilation import float32, jit
 from .environments.base import AbstractEnvironment, AbstractSequenceTask, correct
-from .environments.host import AbstractHostEnvironment, Episodes
+from .environments.host import AbstractHostEnvironment, Episodes, sound
 from .networks.base import AbstractPolicy
 from .types import Evaluation, Sequence, Transition
 
@@ -88,7 +88,7 @@ def score(
 ) -> Float[Array, ""]:
     """Mean return of one policy on fresh episodes, of the signal that the task reports."""
     played = evaluate(env, tree.stack(policy), episodes, key=key)
-    return jnp.mean(played.of(env.reported))
+    return jnp.mean(sound(env, played.of(env.reported)))
 
 
 def blank(env: Environment) -> Transition:

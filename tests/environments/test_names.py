@@ -176,3 +176,32 @@ def test_a_script_names_its_own_classes_and_a_prompt_keeps_them(tmp_path):
         for arguments, given in (([str(script)], None), (["-"], script.read_text()))
     ]
     assert told == ["my_script:Mine False 4\n" * 2, "__main__:Mine True 4\n" * 2]
+
+
+@pytest.mark.parametrize("module", ["evil", "evil.credo", "os"])
+@pytest.mark.parametrize("kwargs", [{}, {"task": ""}, {"task": 0}, {"task": None}])
+def test_a_module_before_an_id_of_credos_is_somebodys_own(module, kwargs):
+    assert names.foreign_code("gymnasium", f"{module}:credo/X-v0", kwargs) is not None
+    own = names.foreign_code("gymnasium", "credo.environments.gymnasium:credo/X-v0", kwargs)
+    assert (own is None) == (kwargs == {})
+    assert names.foreign_code("pettingzoo", "credo.environments.gymnasium:credo/X-v0", kwargs)
+    if kwargs:
+        assert Gymnasium("credo/SequenceRecall-v0", kwargs=kwargs).foreign_code is not None
+
+
+def test_a_worker_knows_gymnasiums_own_code_under_a_scripts_name(registering):
+    entry = "gymnasium.envs.classic_control.cartpole:CartPoleEnv"
+    registering("credo-tests/Pole-v0", entry)
+    env = Gymnasium("credo-tests/Pole-v0")
+    assert env.foreign_code is None
+    assert (env.obs_size, env.max_steps) == (4, 3)
+
+
+def test_wrappers_of_a_scripts_task_are_sent(registering):
+    wrapper = gymnasium.envs.registration.WrapperSpec("W", "somebody:W", {"by": 2})
+    entry = "gymnasium.envs.classic_control.cartpole:CartPoleEnv"
+    registering("credo-tests/Wrapped-v0", entry, additional_wrappers=(wrapper,))
+    assert names.registered("credo-tests/Wrapped-v0")["additional_wrappers"] == [
+        ("W", "somebody:W", {"by": 2})
+    ]
+    assert Gymnasium("credo-tests/Wrapped-v0").foreign_code is not None

@@ -234,7 +234,7 @@ def main() -> None:
     how = HOW if arguments.how == "all" else (arguments.how,)
     times, failed = -(-arguments.times // len(names)), []
     for i, what in enumerate(names):
-        generations = arguments.generations or GENERATIONS[what] * max(times, 2) // 20
+        generations = arguments.generations or GENERATIONS[what] * max(times, 2) // 14
         with tempfile.TemporaryDirectory() as folder:
             found = compare(pathlib.Path(folder), times, generations, arguments.seed + i, what, how)
         print(f"{what}: differing files: {', '.join(found) or 'none'}", flush=True)

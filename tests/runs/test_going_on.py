@@ -138,6 +138,16 @@ def test_a_buffer_that_grows_changes_no_bit(bounded, straight, tmp_path, capsys)
     resume(straight, generations=12)  # whose checkpoints fit the smaller one too
 
 
+def test_a_setting_that_makes_generations_longer_has_its_buffer(bounded, tmp_path):
+    train(tmp_path / "run", generations=2)
+    run = resume(tmp_path / "run", set={"episodes": 40}, generations=4)
+    frames = int(run.metrics["frames"][-1])
+    fit = loop.fitted(run.algorithm, loop.Budget(10))
+    (buffer,) = loop._buffers(loop._load(run, fit).state)
+    assert int(buffer.written) == int(buffer.size) == frames  # nothing was overwritten
+    assert resume(tmp_path / "run", generations=6).metrics["generation"][-1] == 6
+
+
 # Weights that are no numbers.
 
 

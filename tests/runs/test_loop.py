@@ -379,7 +379,9 @@ def test_a_disk_too_full_for_metrics_says_so_and_the_run_goes_on_later(straight,
 def test_another_machine_is_mentioned(stopped, monkeypatch):
     here = config.machine()
     monkeypatch.setattr(config, "machine", lambda: here | {"cores": here["cores"] + 1})
-    with pytest.warns(UserWarning, match=r"began elsewhere \(cores: .* not bit for bit"):
+    with pytest.warns(
+        UserWarning, match=r"began under other conditions \(cores: .* not bit for bit"
+    ):
         run = resume(stopped)
     assert run.metrics["generation"][-1] == run.config["budget"]["generations"]  # it goes on
 

@@ -5,7 +5,10 @@
 
 import atexit
 import collections
+import contextlib
+import math
 import os
+import sys
 import threading
 import warnings
 import weakref
@@ -112,7 +115,8 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
         """Whose code opening this would import, by name; None for what Gymnasium, PettingZoo, MPE2
         and Credo themselves have."""
         makers = (at for _, at in self._paid()["rewards"])
-        return names.foreign_code(self.api, self.id, dict(self.kwargs)) or next(makers, None)
+        code = names.foreign_code(self.api, self.id, dict(self.kwargs))
+        return next(makers, None) if code is None else code
 
     @property
     def here(self) -> bool:
@@ -186,6 +190,7 @@ class ForeignCopies(AbstractCopies):
         self._hurt = False  # whether there are any such: else a step costs less
         self._recent: collections.deque[str] = collections.deque(maxlen=100)  # why it failed, or ""
         self._whys: dict[int, str] = {}
+        self._discarded = 0  # episodes, since these copies were made
         self._backend: worker.Environments | worker.Process | None = None
         _SIZES[env] = sizes = self._opened().sizes()
         team = () if sizes["agents"] is None else (sizes["agents"],)
@@ -298,6 +303,8 @@ class ForeignCopies(AbstractCopies):
         for copy, fault in faults.items():
             self._whys[copy] = self._told(name, copy, fault)
             self._recent.append(self._whys[copy])
+            self._discarded += 1
+            self._say(self._whys[copy])
         playing = int(self._running.sum()) - len(faults)  # as good as any until they fail
         failures, recent = self.failures, min(len(self._recent) + playing, 100)
         most = self._env.tolerated
@@ -306,6 +313,17 @@ class ForeignCopies(AbstractCopies):
             self.close(grace=0.0)
             count = f" ({failures} of {recent} episodes failed)" if failures > 1 else ""
             raise EnvironmentFailure(f"{first}{count}") from next(iter(faults.values()))
+
+    def _say(self, why: str) -> None:
+        """The first, tenth, hundredth … failure, on the error stream."""
+        if self._env.tolerated and math.log10(self._discarded).is_integer():
+            with contextlib.suppress(OSError, ValueError):  # nobody reads it
+                print(
+                    f"credo: {self._discarded:,} episode{'s' * (self._discarded > 1)} failed and "
+                    f"left out, now: {why}. The run ends if more than {self._env.tolerated:.0%} of "
+                    "the last 100 fail (--tolerated)",
+                    file=sys.stderr,
+                )
 
     def _told(self, name: str, copy: int, fault: worker.Fault) -> str:
         where = f"step {self._steps[copy]}" if name == "step" else "the reset"

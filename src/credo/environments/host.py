@@ -136,6 +136,15 @@ class InTurn(AbstractCopies):
                 self._whys[lane] = self.inner.failure_text(seat)
 
 
+def sound(env: Any, returns: Any) -> Any:
+    """Of the returns of a test those that are numbers: of a task outside JAX, episodes that failed
+    are left out, unless all did."""
+    if not isinstance(env, AbstractHostEnvironment):
+        return returns
+    kept = np.isfinite(np.asarray(returns))
+    return returns if kept.all() or not kept.any() else np.asarray(returns)[kept]
+
+
 class AbstractHostEnvironment(eqx.Module):
     """A task outside JAX: a config compared by value, whose `copies` play it."""
 

@@ -7,6 +7,7 @@ same: `foreign_code` says whose code a name would import. No JAX here: a worker 
 """
 
 import contextlib
+import dataclasses
 import importlib
 import importlib.util
 import inspect
@@ -178,10 +179,12 @@ def kind_of(name: str, kwargs: Mapping[str, Any] | None = None) -> str | None:
 def foreign_code(api: str, id: str, kwargs: Mapping[str, Any]) -> str | None:
     """Whose code opening this would import, by name; None for what Gymnasium, PettingZoo, MPE2 and
     Credo themselves have. Imports nothing."""
-    if id.rpartition(":")[2].startswith("credo/") and "task" in kwargs:
-        return str(kwargs["task"])  # which credo.environments.gymnasium.make would import
-    if ":" in id:
-        return None if id.startswith("credo.environments.gymnasium:credo/") else id
+    module, _, name = id.rpartition(":")
+    credos = api == "gymnasium" and name.startswith("credo/")
+    if ":" in id and not (credos and module == "credo.environments.gymnasium"):
+        return id
+    if credos:  # `task` is what credo.environments.gymnasium.make would import
+        return str(kwargs["task"] or repr(kwargs["task"])) if "task" in kwargs else None
     if api == "pettingzoo":
         registry = getattr(sys.modules.get("pettingzoo"), "parallel_registry", {})
         entry = registry[id].entry_point if id in registry else id
@@ -201,10 +204,10 @@ def _own(spec: Any) -> bool:
 
 def registered(id: str) -> dict[str, Any] | None:
     """What this process's registry says of an id, for a worker that never saw the script which
-    registered it: plain values. None if the worker knows as much; `entry_point` is None if what is
-    registered cannot be told."""
+    registered it: plain values. None if there is no such id here; `entry_point` is None if what is
+    registered cannot be told. Also of one whose code is Gymnasium's: a script may have named it."""
     spec = gymnasium.registry.get(id)
-    if spec is None or _own(spec):
+    if spec is None:
         return None
     entry = name_of(spec.entry_point) if _nameable(spec.entry_point) else spec.entry_point
     entry = name_of(entry) if isinstance(entry, str) else None
@@ -216,7 +219,7 @@ def registered(id: str) -> dict[str, Any] | None:
         "order_enforce": spec.order_enforce,
         "additional_wrappers": [dataclasses.astuple(x) for x in spec.additional_wrappers],
     }
-    if entry is None or here_alone(entry) or not _json(told):
+    if entry is None or (not _own(spec) and here_alone(entry)) or not _json(told):
         return {"id": spec.id, "entry_point": None}
     return told
 

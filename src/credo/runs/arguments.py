@@ -124,6 +124,8 @@ def in_range(options: Any, seeds: int = 1) -> None:
         flag = f"--{name.replace('_', '-')}"
         if name in COUNTS and value < 1:
             fail(f"{flag} is {value}: it must be at least 1")
+        if name in COUNTS and value >= 2**63:
+            fail(f"{flag} is {value:g}: it must be less than 2^63")
         if name == "seed":
             last = value + max(seeds, 1) - 1
             if not 0 <= value <= last < SEEDS:

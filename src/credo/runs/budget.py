@@ -21,7 +21,7 @@ class Budget:
     def __post_init__(self):
         for name in ("generations", "frames"):
             if getattr(self, name) is not None:
-                require.at_least(name, getattr(self, name), 1)
+                require.within(name, getattr(self, name), 1, 2**63 - 1)
         if self.generations is None and self.frames is None:
             raise ValueError("a run needs a budget: give generations, frames or both")
 
@@ -117,6 +117,13 @@ def fitted(algorithm: Any, budget: Budget) -> Any:
     # Budgets of about the same size share their programs.
     rows = min(capacity, 1 << (max(1, min(bounds)) - 1).bit_length())
     return dataclasses.replace(algorithm, replay_capacity=rows)
+
+
+def fitted_as(algorithm: Any, other: Any) -> Any:
+    """`algorithm` with the replay buffer of `other`, if they have one."""
+    if not hasattr(other, "replay_capacity"):
+        return algorithm
+    return dataclasses.replace(algorithm, replay_capacity=other.replay_capacity)
 
 
 def short(number: float) -> str:

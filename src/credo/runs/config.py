@@ -104,8 +104,10 @@ def from_tree(tree: Any, *, trust: bool = True, source: str = "this record") -> 
         if "class" not in tree:
             return fields
         made = _made(find_class(tree["class"]), fields, at.lstrip("."))
-        named = None if trust else _foreign_code(made)
-        if named is not None:  # before anything is made of it, which may open it
+        foreign = isinstance(made, AbstractForeignEnvironment) and not trust
+        if (
+            foreign and (named := made.foreign_code) is not None
+        ):  # before anything is made of it, which may open it
             raise ConfigError(_untrusted(source, named))
         return made
 
@@ -131,16 +133,6 @@ def class_names(tree: Any) -> Iterator[str]:
     if isinstance(tree, list):
         for value in tree:
             yield from class_names(value)
-
-
-def _foreign_code(env: Any) -> str | None:
-    """The code of somebody's own that opening this environment would import."""
-    if not isinstance(env, AbstractForeignEnvironment):
-        return None
-    if hasattr(type(env), "foreign_code"):
-        return env.foreign_code  # pyright: ignore[reportAttributeAccessIssue]
-    registered = env.api == "gymnasium" and re.fullmatch(r"[\w/-]+", env.id)
-    return None if registered else env.id
 
 
 def _made(cls: type, fields: dict[str, Any], at: str) -> Any:

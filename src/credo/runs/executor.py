@@ -135,8 +135,9 @@ def run(jobs: list[Job], workers: int | None = None, *, title: str = "runs") -> 
                 under_way.remove(job)
                 if "error" in answer:
                     failures.append(f"{job.path}: {answer['error']}")
-                done += 1
-                board.finished(job, done)
+                if not signals.received:  # else it was stopped and saved, not finished
+                    done += 1
+                    board.finished(job, done)
             if process.poll() is not None:
                 _end(process)
                 process = begun(core)

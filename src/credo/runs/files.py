@@ -24,8 +24,16 @@ Chunk = bytes | memoryview
 
 @contextlib.contextmanager
 def whole(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Inside the `with` block write the file that is yielded: afterwards it is `path`, whole and
-    on the disk. Until then, and for good if the block raises, `path` is what it was.
+    """The draft of `path`, to be written by its name (see `_drafted`)."""
+    with _drafted(path) as (draft, _):
+        yield draft
+
+
+@contextlib.contextmanager
+def _drafted(path: str | os.PathLike[str]) -> Iterator[tuple[Path, int]]:
+    """Inside the `with` block write the file that is yielded, with its descriptor: afterwards it is
+    `path`, whole and on the disk. Until then, and for good if the block raises, `path` is what it
+    was.
 
     The folder is made if there is none. The draft lies beside `path`, exists already, is empty and
     has the same suffix; what had its name is removed first. Raises `OSError`.
@@ -36,7 +44,7 @@ def whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     remove(draft)
     descriptor = opened(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
     try:
-        yield draft
+        yield draft, descriptor
         if os.fstat(descriptor).st_nlink == 0:
             raise OSError(errno.EBUSY, "somebody else writes it at the same time", str(path))
         os.fsync(descriptor)
@@ -55,12 +63,8 @@ def whole(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 def write_whole(path: str | os.PathLike[str], chunks: Iterable[Chunk]) -> None:
     """Write `chunks` one after the other as the file `path`, whole or not at all (see `whole`)."""
-    with whole(path) as draft:
-        descriptor = opened(draft, os.O_WRONLY)
-        try:
-            _write(descriptor, path, chunks)
-        finally:
-            os.close(descriptor)
+    with _drafted(path) as (_, descriptor):  # not by name: the draft may be another writer's by now
+        _write(descriptor, path, chunks)
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

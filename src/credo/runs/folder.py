@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from . import files
-from .lock import lock
+from .lock import is_lock, lock
 from .record import NAME, RunError
 
 DRAFT = re.compile(r"\.config\.json\.draft(\.json)?")
@@ -49,7 +49,7 @@ def new_folder(path: pathlib.Path) -> Iterator[None]:
     """Own a new or empty folder for a run. If none comes to be in it, all is as it was before."""
     _refuse_occupied(path)
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    locked = (path / "lock").exists()
+    locked = os.path.lexists(path / "lock")
     try:
         with lock(path):
             _refuse_occupied(path)  # another process may have been quicker
@@ -57,14 +57,15 @@ def new_folder(path: pathlib.Path) -> Iterator[None]:
             try:
                 yield
             except BaseException:
-                if not (path / NAME).exists() and not begun:
-                    files.remove(path / "checkpoints")
+                if not (path / NAME).exists():
+                    if not begun:
+                        files.remove(path / "checkpoints")
+                    if not locked:  # while it is ours: later it may be another's
+                        files.remove(path / "lock")
                 raise
     except BaseException:
         if not (path / NAME).exists():
             with contextlib.suppress(OSError):  # something else may lie there by now
-                if not locked:
-                    files.remove(path / "lock")
                 for folder in made:
                     folder.rmdir()
         raise
@@ -76,6 +77,7 @@ def _leftover(path: pathlib.Path) -> bool:
     for entry in path.iterdir():
         if entry.name == "lock" or DRAFT.fullmatch(entry.name):
             ours = entry.is_file() and not entry.is_symlink()
+            ours = ours and (entry.name != "lock" or is_lock(entry))
         else:
             ours = entry.name == "checkpoints" and _holds(entry, _first_checkpoint)
         if not ours:

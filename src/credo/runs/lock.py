@@ -41,6 +41,8 @@ def lock(run_directory: Path) -> Iterator[None]:
             raise RunLocked(_message(Path(run_directory), content)) from None
         except OSError as error:  # of a file system without locks
             raise files.named(error, path) from error
+        if not _is_at(descriptor, path):  # who had it has just removed it with its folder
+            raise RunLocked(_message(Path(run_directory), ""))
         now = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
         holder = {"pid": os.getpid(), "host": socket.gethostname(), "started": now}
         _write(descriptor, json.dumps(holder))
@@ -51,6 +53,22 @@ def lock(run_directory: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_UN)  # a forked child may keep the file open
     finally:
         os.close(descriptor)
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+def is_lock(path: Path) -> bool:
+    """Whether a file is a lock of ours: empty, or with its holder's name."""
+    try:
+        content = files.read_bytes(path, most=MOST)
+        return not content or set(json.loads(content)) == {"pid", "host", "started"}
+    except (OSError, ValueError, TypeError):
+        return False
 
 
 def _write(descriptor: int, content: str) -> None:

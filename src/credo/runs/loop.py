@@ -32,7 +32,7 @@ from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..replay import Replay, shapes_alone
 from ..types import NOTHING
 from . import checkpoint, config, files, log, policy, record, screen, weights
-from .budget import Budget, fitted
+from .budget import Budget, fitted, fitted_as
 from .folder import free_name, new_folder
 from .folder import runs_in as runs_in
 from .lock import lock
@@ -238,11 +238,15 @@ def resume(
         budget = old if stop_at is None else dataclasses.replace(old, stop_at=stop_at)
         if generations is not None or frames is not None:
             budget = Budget.of(algorithm, generations, frames, stop_at)
-        # A smaller budget is refused, but only once it is known how far the run is.
+        # A smaller budget is refused, but only once it is known how far the run is. A setting may
+        # make generations longer: the buffer must hold what either plays.
+        settings = (algorithm, config.replaced(algorithm, dict(set or {})))
         fit = max(
-            (fitted(algorithm, limit) for limit in (old, budget)),
+            (fitted(one, limit) for one in settings for limit in (old, budget)),
             key=lambda one: getattr(one, "replay_capacity", 0),
         )
+        if set:
+            fit = fitted_as(algorithm, fit)
         with _found(run):
             record.check_task(run.config, algorithm.env)
             saved = _load(run, fit, without_replay)
@@ -255,7 +259,7 @@ def resume(
         fit = _changed(run, fit, set or {}, saved.generation)
         _record_budget(run, old, budget, saved.generation)
         if run.config != record.read(run.path) or (trust and not signed_here(run.config)):
-            record.write(run.path, run.config)
+            record.write(run.path, run.config, sign=run.trusted)
         _warn_of_other_machine(run.config["machine"])
         return _train(
             run,
@@ -284,7 +288,7 @@ def _changed(run: Run, fit: Any, changes: Mapping[str, Any], generation: int) ->
     if not changes:
         return fit
     new = config.replaced(fit, dict(changes))
-    if _shapes(new) != _shapes(fit):
+    if "replay_capacity" in changes or _shapes(new) != _shapes(fit):
         told = ", ".join(f"{name}={value!r}" for name, value in changes.items())
         raise RunError(
             f"{told} changes the sizes of what {run.path} has learned: only numbers that change "
@@ -352,7 +356,9 @@ def _verify_metrics(run: Run) -> None:
         if why is None:
             return
         if checkpoint.damage(folder) is None and not record.stranger(run.config, seals["record"]):
-            raise RunError(f"{why}, or `credo resume {run.path}` trains again what is not sure")
+            raise RunError(
+                f"{why}; `credo resume` goes on from the newest checkpoint it agrees with"
+            )
 
 
 def _unlike(path: pathlib.Path, sealed: Any) -> str | None:
@@ -612,6 +618,7 @@ def _warn_of_other_machine(recorded: dict[str, Any]):
         lines = config.differences(recorded.get(what, {}), here[what], what)
         if lines:
             warnings.warn(
-                f"this run began elsewhere ({'; '.join(lines)}): it goes on, but not bit for bit",
+                f"this run began under other conditions ({'; '.join(lines)}): it goes on, but not "
+                "bit for bit",
                 stacklevel=3,
             )

@@ -84,10 +84,11 @@ def read(folder: pathlib.Path) -> Record:
     return record
 
 
-def write(folder: pathlib.Path, record: dict[str, Any]) -> None:
-    """Write config.json, with a checksum and this user's signature."""
+def write(folder: pathlib.Path, record: dict[str, Any], *, sign: bool = True) -> None:
+    """Write config.json, with a checksum and, unless somebody else's record was changed, with this
+    user's signature."""
     said = {k: v for k, v in record.items() if k not in (trust.CHECKSUM, trust.SIGNATURE)}
-    if signature := trust.sign(said):
+    if sign and (signature := trust.sign(said)):
         said |= {trust.SIGNATURE: signature}
     files.write_json(folder / NAME, said | {trust.CHECKSUM: _checksum(said)})
 
@@ -102,8 +103,8 @@ def stranger(record: Mapping[str, Any], sealed: Any) -> str | None:
         return (
             f"it was written for a run with seed {sealed.get('seed')}, this one has {ours['seed']}"
         )
-    before = {change.get("before") for change in record.get("changes", [])}
-    if sealed.get("algorithm") not in {ours["algorithm"], *before}:
+    before = [change.get("before") for change in record.get("changes", [])]
+    if sealed.get("algorithm") not in [ours["algorithm"], *before]:
         return "it was written for a run with another algorithm, task or settings"
     return None
 
@@ -226,6 +227,10 @@ def _is_changes(value: Any) -> bool:
     )
 
 
+def _is_hash(value: Any) -> bool:
+    return isinstance(value, str) and re.fullmatch("[0-9a-f]+", value) is not None
+
+
 def _is_text(value: Any) -> bool:
     return isinstance(value, str)
 
@@ -240,6 +245,6 @@ FIELDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "warm_start": (_is_text, "the path of a run"),
     "changes": (_is_changes, "a list of objects, each with a generation"),
     "resumable": (lambda value: isinstance(value, bool), "true or false"),
-    trust.CHECKSUM: (_is_text, "a text"),
-    trust.SIGNATURE: (_is_text, "a text"),
+    trust.CHECKSUM: (_is_hash, "a number in hexadecimal digits"),
+    trust.SIGNATURE: (_is_hash, "a number in hexadecimal digits"),
 }

@@ -6,7 +6,6 @@ run goes on without a word; one from elsewhere must be trusted first. Nothing ra
 run computes: champions and checkpoints hold hashes alone.
 """
 
-import contextlib
 import hashlib
 import hmac
 import json
@@ -42,13 +41,6 @@ def seal(record: Mapping[str, Any]) -> dict[str, Any]:
         "budget": record.get("budget"),
         "versions": short(record.get("machine", {}).get("versions")),
     }
-
-
-def digest(record: Mapping[str, Any]) -> str:
-    """SHA-256 of a run's algorithm, seed and versions: of all but its budget, which may grow."""
-    parts = seal(record)
-    del parts["budget"]
-    return hashlib.sha256(canonical(parts)).hexdigest()
 
 
 def sign(record: Mapping[str, Any]) -> str | None:
@@ -118,8 +110,12 @@ def _make(path: pathlib.Path) -> None:
             file.write(secrets.token_bytes(SIZE))
             file.flush()
             os.fsync(descriptor)
-        with contextlib.suppress(FileExistsError):
+        try:
             os.link(draft, path)
+        except FileExistsError:
+            pass
+        except OSError:  # a file system without hard links
+            os.replace(draft, path)
     finally:
         files.remove(draft)
 

@@ -97,6 +97,6 @@ def _train(job: dict[str, Any]) -> None:
         # Its settings are those of the job: the parent looked (`Job.finished`).
         loop.resume(path, trust=job["trust"], progress=False, **options)
     else:
-        algorithm = config.from_tree(job["algorithm"])
+        algorithm = config.from_tree(job["algorithm"], trust=job["trust"])
         start = {"seed": job["seed"], "warm_start": job["warm_start"]}
         loop.train(algorithm, path=path, progress=False, **start, **options)
