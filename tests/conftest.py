@@ -1,10 +1,15 @@
 import os
+import signal
 import tempfile
 
 # Tests run one worker per core: one thread each, and programs compiled for speed of compiling.
 os.environ.setdefault(
     "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0"
 )
+
+# Where tests are started by `nohup` or in the background, what they start would ignore these.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import jax
 import pytest

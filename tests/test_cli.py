@@ -870,3 +870,15 @@ def test_a_task_and_an_algorithm_that_do_not_go_together(credo, words, told, tmp
     assert told in err.splitlines()[-1]
     assert err.startswith("credo: ")
     assert list(tmp_path.iterdir()) == []  # nothing was begun
+
+
+def test_ctrl_c_ends_a_command_without_taking_python_apart():
+    """jaxlib, interrupted while it is imported, crashed there: exit code -11 in place of 130."""
+    script = (
+        "import atexit, sys\nfrom credo import cli\n"
+        "atexit.register(lambda: print('taken apart'))\n"
+        "def stop(argv):\n    print('begun')\n    raise KeyboardInterrupt\n"
+        "cli._list = stop\nsys.argv = ['credo', 'list']\ncli.main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "begun\n", "credo: stopped\n")

@@ -201,7 +201,8 @@ COMMANDS = {
 def main(argv: list[str] | None = None) -> None:
     """Entry point of `credo`. Whatever happens ends in a line and an exit code (see `ending`)."""
     ending.open_streams()
-    ending.run(lambda: _command(list(sys.argv[1:] if argv is None else argv)))
+    words = list(sys.argv[1:] if argv is None else argv)
+    ending.run(lambda: _command(words), alone=argv is None)
 
 
 def _command(argv: list[str]) -> None:

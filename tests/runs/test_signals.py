@@ -1,5 +1,6 @@
 """Nothing on the screen ends a training, and no wait outlives a second signal."""
 
+import contextlib
 import io
 import os
 import pathlib
@@ -11,7 +12,7 @@ import time
 
 import pytest
 
-from credo.runs import screen
+from credo.runs import screen, signals
 from credo.runs.budget import Budget
 from credo.runs.progress import Progress
 from credo.runs.signals import Signals
@@ -201,3 +202,18 @@ def _alive(group):
     except ProcessLookupError:
         return False
     return True
+
+
+def test_a_ctrl_c_that_was_swallowed_is_remembered():
+    """As in a callback of C code, where nobody hears of an exception."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        signals.hear()
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        with signals.Signals() as heard:
+            assert heard.received == signal.SIGINT
+        with signals.Signals() as heard:
+            assert heard.received == 0
+    finally:
+        signal.signal(signal.SIGINT, before)

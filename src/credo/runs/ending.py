@@ -5,6 +5,7 @@ where nobody reads what is printed. What nobody foresaw leaves its traceback in 
 line names. Nothing here imports JAX.
 """
 
+import contextlib
 import linecache
 import os
 import pathlib
@@ -15,7 +16,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from . import screen
+from . import screen, signals
 
 ROOT = str(pathlib.Path(__file__).parents[1]) + os.sep  # Credo's own code
 PIPE, INTERRUPT = 141, 130
@@ -26,8 +27,11 @@ def say(text: str) -> None:
     screen.say("".join(c if c.isprintable() or c in "\n\t" else f"\\x{ord(c):02x}" for c in text))
 
 
-def run(command: Callable[[], Any]) -> None:
-    """Call `command`. What it raises ends as `SystemExit` with a code, and is said."""
+def run(command: Callable[[], Any], *, alone: bool = False) -> None:
+    """Call `command`. What it raises ends as `SystemExit` with a code, and is said. `alone`: it is
+    all that this process does."""
+    if alone:
+        signals.hear()
     try:
         try:
             command()
@@ -35,9 +39,20 @@ def run(command: Callable[[], Any]) -> None:
             sys.stdout.flush()
     except BaseException as error:
         code = _code(error)
+        if alone and isinstance(error, KeyboardInterrupt):
+            _leave(code)
     else:
         return
     raise SystemExit(code)  # outside of `except`: nothing is chained that might be printed
+
+
+def _leave(code: int) -> None:
+    """End at once. A library that Ctrl-C met while it was imported is half there, and may crash as
+    Python takes itself apart; what was to be saved was saved before, and workers end with us."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):
+            stream.flush()
+    os._exit(code)
 
 
 def open_streams() -> None:

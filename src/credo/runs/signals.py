@@ -11,6 +11,20 @@ from typing import Any
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE = 2.0  # seconds from a second signal until the process is ended, whatever it waits for
 
+_heard: list[int] = []  # a Ctrl-C that `hear` remembers
+
+
+def hear() -> None:
+    """From now on remember a Ctrl-C: while a library is imported or C code calls back, the
+    `KeyboardInterrupt` that it raises may be swallowed, and a run would begin as if nothing was."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _remember)
+
+
+def _remember(number, frame):
+    _heard.append(number)
+    raise KeyboardInterrupt
+
 
 class Signals:
     """Ctrl-C, SIGTERM and SIGHUP ask for an end after the generation; a second one stops at once.
@@ -34,6 +48,7 @@ class Signals:
                 if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                     self._before[number] = signal.signal(number, self._receive)
             self._listen()
+            self.received = _heard.pop() if _heard else 0
         return self
 
     def _receive(self, number, frame):
