@@ -110,8 +110,10 @@ def flip(path: pathlib.Path, rng: random.Random) -> bytes:
     return before
 
 
-def count(folder: pathlib.Path, times: int, seed: int = 0) -> dict[str, Counter[str]]:
-    """What became of `times` flips in each file, by its name."""
+def count(
+    folder: pathlib.Path, times: int, seed: int = 0, only: str = ""
+) -> dict[str, Counter[str]]:
+    """What became of `times` flips in each file with `only` in its name, by that."""
     rng, counts = random.Random(seed), {}
     for run in make(folder):
         right = read(run)
@@ -121,6 +123,8 @@ def count(folder: pathlib.Path, times: int, seed: int = 0) -> dict[str, Counter[
             if path.parent in older - {newest}:
                 continue  # an older checkpoint is read only once a newer one is damaged
             name = f"{run.name}/{path.relative_to(run)}"
+            if only not in name:
+                continue
             counts[name] = Counter()
             for _ in range(times):
                 before = flip(path, rng)
@@ -135,9 +139,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--times", type=int, default=600, help="in each file")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="files with this in their name")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        counts = count(pathlib.Path(folder), arguments.times, arguments.seed)
+        counts = count(pathlib.Path(folder), arguments.times, arguments.seed, arguments.only)
     total = sum(counts.values(), Counter())
     print(f"{total.total()} flips in {len(counts)} files: {dict(total)}")
     raise SystemExit(bool(set(total) - {"named", "harmless"}))
