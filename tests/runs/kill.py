@@ -61,22 +61,22 @@ TRAIN = {
     "matd3": f"matd3 {TEAM_ALONE}",
     "maddpg": f"maddpg {TEAM_ALONE}",
 }
-GENERATIONS = {  # enough for 20 disturbances
+GENERATIONS = {  # half of them are enough for seven disturbances
     "neuroevolution": 100_000,
     "bptt": 20_000,
     "ccea": 60_000,
     "islands": 60_000,
-    "dmmu": 20_000,
+    "dmmu": 80_000,
     "erl": 300,
     "cerl": 150,
     "ea": 400,
-    "merl": 100_000,
-    "td3": 2_000,
-    "ddpg": 2_000,
-    "sac": 2_000,
-    "ppo": 600,
-    "matd3": 150_000,
-    "maddpg": 150_000,
+    "merl": 4_000,
+    "td3": 1_400,
+    "ddpg": 1_400,
+    "sac": 1_200,
+    "ppo": 500,
+    "matd3": 120_000,
+    "maddpg": 120_000,
 }
 SIGNALS = {
     "term": signal.SIGTERM,
@@ -224,7 +224,7 @@ def main() -> None:
     parser.add_argument("--what", choices=[*TRAIN, "all"], default="neuroevolution")
     parser.add_argument("--how", choices=[*HOW, "all"], default="kill")
     parser.add_argument("--times", type=int, default=20, help="of all runs together")
-    parser.add_argument("--generations", type=int, help="enough for 20 by default")
+    parser.add_argument("--generations", type=int, help="by default as many as so many take")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     arguments = parser.parse_args()
     # Where this was started by `nohup` or in the background, its children would ignore them.
