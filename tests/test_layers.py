@@ -15,6 +15,7 @@ LEVELS = [
     {"algorithms"},
     {"analysis"},
     {"runs"},
+    {"report"},
     {"experiments"},
     {"cli"},
     {"__main__"},

@@ -85,7 +85,7 @@ _EXPORTS = {
     "NoisyObservations": "environments.wrappers",
     "Runner": "runner",
     "export": "runs.export",
-    "watch": "runs.watch",
+    "watch": "report.watch",
 }
 __all__ = sorted(_EXPORTS)  # pyright: ignore[reportUnsupportedDunderAll]
 

@@ -533,7 +533,8 @@ def _watch(argv: list[str]) -> None:
     trust, argv = pop_switch(argv, "--trust")
     (options,) = parse("credo watch RUN [FILE]", None, WatchOptions, argv, popped=("--trust",))
     in_range(options, options.episodes)
-    from .runs import loop, watch
+    from .report import watch
+    from .runs import loop
 
     run = loop.Run(_one_run("watch", path), trust=trust)
     target = pathlib.Path(film) if film else None
@@ -604,7 +605,7 @@ def _report(argv: list[str]) -> None:
             "  running runs, or folders of runs; runs that differ only in their seed are one curve"
         )
         raise SystemExit(0 if asked else 2)
-    from .runs import report
+    from .report import run_page as report
 
     named = [pathlib.Path(token) for token in argv]
     paths = [run for path in named for run in _runs(path)]

@@ -13,7 +13,7 @@ from credo.environments.sequence_classification import SequenceClassification
 from credo.experiments import base, beyond_3, chapter3, chapter3_gradient, fig_3_11, fig_3_12
 from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
-from credo.runs import page
+from credo.report import page
 from credo.runs.loop import train
 
 NAMES = ("fig-3.4b", "fig-3.9b", "fig-3.11", "fig-3.12", "fig-3.13", "beyond-3")

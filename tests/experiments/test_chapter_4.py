@@ -13,7 +13,7 @@ from credo.environments.server_fleet import ServerFleet
 from credo.environments.wrappers import NoisyObservations
 from credo.experiments import base, beyond_4, chapter4, chapter4_fleet, table_4_1
 from credo.networks.dmmu import DMMU
-from credo.runs import page
+from credo.report import page
 from credo.runs.loop import train
 
 NAMES = ("fig-4.2", "fig-4.3", "fig-4.4", "fig-4.7", "fig-4.8", "table-4.1", "beyond-4")

@@ -17,8 +17,10 @@ from credo.experiments import base, chapter5, chapter6, check_td3, fig_5_2, note
 from credo.learners.manager import UCB
 from credo.learners.sac import SAC
 from credo.learners.td3 import ddpg
+from credo.report import page
+from credo.report import run_page as report
 from credo.rollout import evaluate
-from credo.runs import checkpoint, config, log, page, report
+from credo.runs import checkpoint, config, log
 from credo.runs.loop import Run
 
 OTHERS = ("3.", "3", "4.", "4", "7.", "7", "sp")  # chapters 3, 4 and 7

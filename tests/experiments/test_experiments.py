@@ -16,7 +16,8 @@ from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
 from credo.experiments import base, chapter3, fig_3_4a
 from credo.networks.mmu import MMU
-from credo.runs import config, executor, page
+from credo.report import page
+from credo.runs import config, executor
 from credo.runs.loop import Run, RunError, train
 
 BUDGETS = base.BUDGETS

@@ -711,7 +711,8 @@ LIMITED = """
 import resource, sys
 import numpy as np
 from pathlib import Path
-from credo.runs import checkpoint, page
+from credo.runs import checkpoint
+from credo.report import page
 directory = Path(sys.argv[1])
 empty = page.Page("title", "lead", "command", [])
 

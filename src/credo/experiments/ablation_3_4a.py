@@ -10,8 +10,8 @@ import numpy as np
 from ..algorithms.neuroevolution import Neuroevolution
 from ..analysis import counting
 from ..evolution.curriculum import Curriculum
+from ..report.page import Curve, Figure, Reference, Table
 from ..runs.loop import Run
-from ..runs.page import Curve, Figure, Reference, Table
 from . import chapter3
 from .base import Cell
 

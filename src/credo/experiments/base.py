@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 import equinox as eqx
 
+from ..report.page import Page, write
 from ..runs import config, executor, files
 from ..runs.loop import Run, RunError
-from ..runs.page import Page, write
 
 MODULES = {
     "fig-3.4a": "fig_3_4a",

@@ -15,9 +15,9 @@ from ..environments.extended_tmaze import ExtendedTMaze
 from ..environments.server_fleet import ServerFleet
 from ..environments.wrappers import NoisyObservations
 from ..networks.recurrent import Recurrent
+from ..report.page import Table
 from ..rollout import evaluate
 from ..runs.loop import Run
-from ..runs.page import Table
 from . import chapter4, chapter4_fleet, fig_4_7
 from .base import Cell
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from ..analysis import attribution
-from ..runs import report
+from ..report import run_page as report
 from ..runs.loop import Run
 from . import chapter5
 from .base import Cell

@@ -15,8 +15,8 @@ from ..environments.sequence_recall import SequenceRecall
 from ..networks.base import AbstractNetwork
 from ..networks.mmu import MMU
 from ..networks.recurrent import Recurrent
+from ..report.page import Curve, Figure
 from ..runs.loop import Run
-from ..runs.page import Curve, Figure
 from . import chapter3, fig_3_4a
 from .base import Cell
 

@@ -16,10 +16,10 @@ from ..evolution.islands import Islands
 from ..networks.base import AbstractNetwork
 from ..networks.mlp import MLP
 from ..networks.mmu import MMU
+from ..report import maze_page
+from ..report.page import Curve, Figure, HeatMap, Reference, Table, Text, Tracks
 from ..rollout import evaluate
-from ..runs import maze_page
 from ..runs.loop import Run
-from ..runs.page import Curve, Figure, HeatMap, Reference, Table, Text, Tracks
 from .base import Cell
 
 BUDGETS = ("smoke", "quick", "full", "published")

@@ -17,9 +17,9 @@ from ..networks.dmmu import DMMU, DMMUPolicy
 from ..networks.mlp import MLP
 from ..networks.recurrent import Recurrent
 from ..networks.team import Centralized, Team
+from ..report.page import Figure, Table, Text
 from ..rollout import evaluate
 from ..runs.loop import Run
-from ..runs.page import Figure, Table, Text
 from . import chapter4
 from .base import Cell
 from .chapter4 import Plan as Plan

@@ -9,9 +9,9 @@ import numpy as np
 from ..algorithms.erl import ERL
 from ..environments.gymnasium import Gymnasium
 from ..learners.td3 import TD3
-from ..runs import report
+from ..report import run_page as report
+from ..report.page import Section, Table
 from ..runs.loop import Run
-from ..runs.page import Section, Table
 from . import beyond_5, chapter5
 from .base import Cell
 

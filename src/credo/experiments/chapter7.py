@@ -15,9 +15,9 @@ from ..environments.rover import Rover
 from ..learners.td3 import TD3, maddpg, matd3
 from ..networks.mlp import Critic
 from ..networks.team import JointCritic, Team
+from ..report.page import Curve, Figure, Reference, Table, Text
 from ..rollout import evaluate
 from ..runs.loop import Run
-from ..runs.page import Curve, Figure, Reference, Table, Text
 from .base import Cell
 from .chapter5 import middle, number
 

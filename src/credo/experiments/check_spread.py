@@ -13,9 +13,9 @@ from ..learners.td3 import maddpg, matd3
 from ..networks.exploration import GaussianNoise
 from ..networks.mlp import Critic
 from ..networks.team import JointCritic, Team
+from ..report.page import Curve, Figure, Reference, Table, Text
 from ..rollout import evaluate
 from ..runs.loop import Run
-from ..runs.page import Curve, Figure, Reference, Table, Text
 from . import chapter7
 from .base import Cell
 from .chapter5 import middle

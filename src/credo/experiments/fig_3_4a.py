@@ -4,8 +4,8 @@ import dataclasses
 from typing import Any
 
 from ..analysis import floors
+from ..report.page import Curve, Figure, Reference, Table, Text
 from ..runs.loop import Run
-from ..runs.page import Curve, Figure, Reference, Table, Text
 from . import chapter3
 from .base import Cell
 

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from ..analysis import floors
+from ..report.page import Curve, Figure, Reference, Table
 from ..runs.loop import Run
-from ..runs.page import Curve, Figure, Reference, Table
 from . import chapter3, fig_3_4a
 from .base import Cell
 

@@ -8,8 +8,8 @@ import numpy as np
 from .. import tree
 from ..analysis import memory
 from ..environments.sequence_classification import SequenceClassification
+from ..report.page import HeatMap, Table
 from ..runs.loop import Run
-from ..runs.page import HeatMap, Table
 from . import chapter3
 from .base import Cell
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from ..algorithms.erl import ERL
 from ..algorithms.off_policy import OffPolicy
+from ..report.page import Reference, Table
 from ..runs.loop import Run
-from ..runs.page import Reference, Table
 from . import chapter5
 from .base import Cell
 from .chapter5 import Plan

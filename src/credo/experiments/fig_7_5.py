@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from ..runs import replay_page, trajectories
+from ..report import replay_page, trajectories
+from ..report.page import Drawing, Table
 from ..runs.loop import Run
-from ..runs.page import Drawing, Table
 from . import chapter7
 from .base import Cell
 from .chapter7 import Plan

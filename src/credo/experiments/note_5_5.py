@@ -7,9 +7,9 @@ import numpy as np
 from ..algorithms.erl import ERL
 from ..algorithms.off_policy import OffPolicy
 from ..analysis import attribution
+from ..report.page import Table
 from ..runs import log
 from ..runs.loop import Run
-from ..runs.page import Table
 from . import chapter5
 from .base import Cell
 from .chapter5 import Plan

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 from ..analysis import counting
+from ..report.page import Table
 from ..runs.loop import Run
-from ..runs.page import Table
 from . import chapter3
 from .base import Cell
 

@@ -9,8 +9,8 @@ import numpy as np
 from ..analysis import fleet
 from ..environments.server_fleet import ServerFleet
 from ..networks.dmmu import DMMU
+from ..report.page import Table
 from ..runs.loop import Run
-from ..runs.page import Table
 from . import chapter4_fleet
 from .base import Cell
 from .chapter3 import rounded

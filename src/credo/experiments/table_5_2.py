@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from ..analysis import attribution
+from ..report.page import Table
 from ..runs.loop import Run
-from ..runs.page import Table
 from . import chapter5
 from .base import Cell
 

@@ -15,9 +15,10 @@ from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
-from credo.runs import config, evaluation, log, report
+from credo.report import run_page as report
+from credo.report.page import Page
+from credo.runs import config, evaluation, log
 from credo.runs.loop import Run, RunError, train
-from credo.runs.page import Page
 from credo.types import Evaluation
 
 TASK = SequenceClassification(depth=2, min_gap=1, max_gap=2)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from credo.analysis.statistics import bootstrap_interval
-from credo.runs import plots
-from credo.runs.page import (
+from credo.report import plots
+from credo.report.page import (
     Curve,
     Figure,
     HeatMap,
@@ -22,7 +22,7 @@ from credo.runs.page import (
     Tracks,
     write,
 )
-from credo.runs.page import cell_text as shown
+from credo.report.page import cell_text as shown
 
 HOSTILE = '<script>alert(\'x\')</script> & "$a_$" id="f"'
 
@@ -402,7 +402,8 @@ def test_png_is_written_with_its_title(tmp_path):
 
 def test_describing_a_page_loads_neither_jax_nor_matplotlib():
     program = (
-        "import sys, credo.runs.page; print([m for m in ('jax', 'matplotlib') if m in sys.modules])"
+        "import sys, credo.report.page; "
+        "print([m for m in ('jax', 'matplotlib') if m in sys.modules])"
     )
     run = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True

@@ -18,8 +18,8 @@ from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
 from ..evolution.lineage import MAKERS
 from ..learners.base import AbstractLearner
-from . import config
-from .loop import Run, RunError
+from ..runs import config
+from ..runs.loop import Run, RunError
 from .page import Curve, Figure, Page, Reference, Section, Table
 from .page import write as write_page
 

@@ -24,9 +24,10 @@ from ..environments.extended_tmaze import ExtendedTMaze
 from ..environments.foreign import AbstractForeignEnvironment
 from ..environments.host import AbstractHostEnvironment
 from ..environments.rover import Rover
-from . import files, maze_page, replay_page
-from .loop import Run, RunError
-from .policy import Policy, champion, undelayed
+from ..runs import files
+from ..runs.loop import Run, RunError
+from ..runs.policy import Policy, champion, undelayed
+from . import maze_page, replay_page
 
 FASTEST = 50  # pictures per second: browsers slow a gif down that has more
 STEPS = 30  # per second, where an environment does not say

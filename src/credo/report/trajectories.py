@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from ..environments.rover import Rover
-from . import files
+from ..runs import files
 from .plots import DARK, LIGHT, STYLE, Theme, inline
 from .replay_page import Episode
 

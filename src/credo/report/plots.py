@@ -27,7 +27,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from ..analysis.statistics import bootstrap_interval
-from . import files
+from ..runs import files
 from .page import Curve, Figure, HeatMap, Reference, Tracks
 
 Floats = NDArray[np.float64]

@@ -21,8 +21,8 @@ from ..environments.base import AbstractEnvironment
 from ..environments.rover import BRACKETS, Rover
 from ..networks.base import AbstractPolicy
 from ..rollout import world_keys
+from ..runs import files
 from ..types import TimeStep
-from . import files
 from .page import Page, render
 
 SPEEDS = (1, 2, 5, 10, 20)  # steps per second to choose from
@@ -122,7 +122,7 @@ def write(
 
 
 def player(env: Rover, episodes: Sequence[Episode], *, speed: float = 5) -> str:
-    """HTML that plays the episodes; part of a page with the style of `credo.runs.page`. Several
+    """HTML that plays the episodes; part of a page with the style of `credo.report.page`. Several
     can stand in one page.
 
     **Arguments:** `speed`: steps per second at first, more than 0.

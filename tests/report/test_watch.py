@@ -23,9 +23,9 @@ from credo.environments.wrappers import DelayedHostReward, DelayedReward
 from credo.networks.mlp import MLP
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team
+from credo.report.watch import _maker, _takes, _write_mp4, watch
 from credo.runs import checkpoint, config
 from credo.runs.loop import Run, RunError
-from credo.runs.watch import _maker, _takes, _write_mp4, watch
 from credo.types import TimeStep
 
 LENGTH = 6
@@ -372,7 +372,7 @@ import sys, pathlib
 from credo.environments.gymnasium import Gymnasium
 from test_watch import made
 from credo.runs.loop import RunError
-from credo.runs.watch import watch
+from credo.report.watch import watch
 folder = pathlib.Path(sys.argv[1])
 run = made(folder / "run", Gymnasium("Hopper-v5", max_episode_steps=9, in_process=True))
 try:

@@ -13,9 +13,10 @@ from credo.environments.extended_tmaze import ExtendedTMaze
 from credo.environments.wrappers import DelayedReward
 from credo.networks.mmu import MMU
 from credo.networks.team import Team
-from credo.runs import checkpoint, config, maze_page, page
+from credo.report import maze_page, page
+from credo.report.watch import watch
+from credo.runs import checkpoint, config
 from credo.runs.loop import Run
-from credo.runs.watch import watch
 
 ENV = ExtendedTMaze(depth=1, robots=2, objective="spread")
 NETWORK = MMU(hidden=3, output_activation="tanh")

@@ -22,10 +22,11 @@ from credo.environments.wrappers import DelayedReward
 from credo.networks.base import AbstractPolicy
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team
+from credo.report import replay_page, trajectories
+from credo.report.watch import watch
 from credo.rollout import evaluate
-from credo.runs import checkpoint, config, replay_page, trajectories
+from credo.runs import checkpoint, config
 from credo.runs.loop import Run, RunError
-from credo.runs.watch import watch
 
 ENV = Rover(coupling=2, rovers=3, pois=2, size=8.0, max_steps=9)
 NETWORK = Team(trunk=(4,), head=Recurrent("gru", 3))

@@ -1,0 +1,235 @@
+"""What a page is made of: plain records of figures, tables and text, and no way to draw them.
+
+`figures` draws them with matplotlib, `pages` sets them in HTML and Markdown. Importing these
+records is cheap: it loads neither.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """Independent runs in one cell of a table: shown as their mean (or interquartile mean) with a
+    95 % bootstrap interval, and every run.
+
+    `values`: one per seed, in the order of `seeds`; None where a run has none. `scale`: what they
+    are multiplied with, 100 for percent. `digits`: behind the point; None: three or four in all.
+    """
+
+    values: Sequence[float | None]
+    seeds: Sequence[int] = ()
+    scale: float = 1.0
+    digits: int | None = None
+    centre: Literal["mean", "iqm"] = "mean"
+
+    def __post_init__(self):
+        if len(self.seeds) not in (0, len(self.values)):
+            raise ValueError(
+                f"a summary has {len(self.values)} values and {len(self.seeds)} seeds: give one "
+                "seed for each value, or none at all"
+            )
+
+
+Cell = str | float | Summary | None
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One line of a figure, with every seed it was made from.
+
+    `x[points]` must increase; `runs[seeds, points]`. Values that are not finite are left out;
+    the mean and its interval are drawn where every seed has a value.
+    """
+
+    label: str
+    x: ArrayLike
+    runs: ArrayLike
+
+    def __post_init__(self):
+        points, shape = np.shape(self.x), np.shape(self.runs)
+        if len(points) != 1 or len(shape) != 2 or shape[1:] != points or 0 in shape:
+            raise ValueError(
+                f"curve {self.label!r} has x of shape {points} and runs of shape {shape}: "
+                "x must be [points] and runs [seeds, points], with at least one of each"
+            )
+        if not np.all(np.diff(np.asarray(self.x, dtype=np.float64)) > 0):
+            raise ValueError(f"curve {self.label!r} has an x that does not increase: sort it")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A level to compare with: a floor, a published number, a ceiling."""
+
+    label: str
+    value: float
+
+    def __post_init__(self):
+        if not math.isfinite(self.value):
+            raise ValueError(f"reference {self.label!r} is {self.value}: a level must be finite")
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """Curves over a common axis, with the interval of their centre and every seed."""
+
+    title: str
+    x_label: str
+    y_label: str
+    curves: Sequence[Curve]
+    references: Sequence[Reference] = ()
+    caption: str = ""
+    log_x: bool = False
+    y_range: tuple[float, float] | None = None  # (low, high); widened to show the references
+    centre: Literal["mean", "median"] = "mean"  # the thick line
+
+    def __post_init__(self):
+        if not self.curves:
+            raise ValueError(f"figure {self.title!r} has no curves: give at least one")
+        if self.log_x and any(np.min(curve.x) <= 0 for curve in self.curves):
+            raise ValueError(f"figure {self.title!r} has log_x, but an x that is not positive")
+        if self.y_range is not None and not self.y_range[0] < self.y_range[1]:
+            raise ValueError(f"figure {self.title!r} has y_range {self.y_range}: give (low, high)")
+        if self.centre not in ("mean", "median"):
+            raise ValueError(f"centre is {self.centre!r}: it must be 'mean' or 'median'")
+
+
+@dataclass(frozen=True, eq=False)
+class HeatMap:
+    """`values[rows, columns]` as colours; values of both signs are centred on zero."""
+
+    title: str
+    values: ArrayLike
+    row_labels: Sequence[str]
+    column_labels: Sequence[str]
+    x_label: str
+    y_label: str
+    caption: str = ""
+
+    def __post_init__(self):
+        shape = np.shape(self.values)
+        labels = (len(self.row_labels), len(self.column_labels))
+        if shape != labels or 0 in shape:
+            raise ValueError(
+                f"heat map {self.title!r} has values of shape {shape} and {labels[0]} row and "
+                f"{labels[1]} column labels: values must be [rows, columns], none of them empty"
+            )
+
+
+@dataclass(frozen=True)
+class Track:
+    """Somebody's row at each column of `Tracks`. `notes`: what the table adds at each column."""
+
+    label: str
+    rows: Sequence[int]
+    notes: Sequence[str] = ()
+    scripted: bool = False  # drawn apart from those that learn
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Who is in which row, column by column, and where the goal is. A table says the same.
+
+    Row 0 is at the top. `goals[columns]`: a row; `reached[columns]`: whether it counts as reached.
+    """
+
+    title: str
+    tracks: Sequence[Track]
+    goals: Sequence[int]
+    reached: Sequence[bool]
+    row_labels: Sequence[str]
+    column_labels: Sequence[str]
+    x_label: str
+    y_label: str
+    goal_label: str = "goal"
+    outcomes: tuple[str, str] = ("reached", "missed")  # of a goal, in words
+    breaks: Sequence[int] = ()  # columns that have a line before them
+    caption: str = ""
+
+    def __post_init__(self):
+        columns, rows = len(self.column_labels), len(self.row_labels)
+        every = [self.reached, self.goals, *(x.rows for x in self.tracks)]
+        lengths = [len(x) for x in (*every, *(x.notes for x in self.tracks if x.notes))]
+        if not self.tracks or columns == 0 or set(lengths) != {columns}:
+            raise ValueError(
+                f"tracks {self.title!r} have {columns} column labels, {len(self.tracks)} tracks "
+                f"and {lengths} outcomes, goals, rows and notes: give at least one track, and of "
+                "everything one for each column"
+            )
+        for place in every[1:]:
+            if not all(0 <= row < rows for row in place):
+                raise ValueError(
+                    f"tracks {self.title!r} have {rows} row labels and somebody or a goal in rows "
+                    f"{list(place)}: each must be in 0..{rows - 1}"
+                )
+
+    @property
+    def table(self) -> "Table":
+        """The same in words, a row for each column of the picture."""
+
+        def note(track: Track, column: int) -> list[str]:
+            return [x for x in track.notes[column : column + 1] if x]
+
+        notes = [self.outcomes[0 if reached else 1] for reached in self.reached]
+        told = [Track(self.goal_label, self.goals, notes), *self.tracks]
+        rows = [
+            [label, *(", ".join([self.row_labels[x.rows[i]], *note(x, i)]) for x in told)]
+            for i, label in enumerate(self.column_labels)
+        ]
+        return Table(self.title, [self.x_label, *(x.label for x in told)], rows)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A picture of its own: one `<svg>` element for each colouring, whose ids differ."""
+
+    title: str
+    light: str
+    dark: str
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells: numbers are rounded to four digits and right-aligned, strings are shown as
+    given, None and NaN are a dash."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    caption: str = ""
+
+    def __post_init__(self):
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(
+                    f"table {self.title!r} has {len(self.columns)} columns "
+                    f"and a row of {len(row)} cells: {row!r}"
+                )
+
+
+@dataclass(frozen=True)
+class Text:
+    title: str
+    paragraphs: Sequence[str]
+
+
+Drawn = Figure | HeatMap | Tracks | Drawing
+Section = Drawn | Table | Text
+
+
+@dataclass(frozen=True)
+class Page:
+    """`command` is what makes the page, exactly as typed; `facts` say where its numbers come
+    from: versions, processor, seeds."""
+
+    title: str
+    lead: str
+    command: str
+    sections: Sequence[Section]
+    facts: Mapping[str, str] = field(default_factory=dict)
