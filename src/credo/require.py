@@ -1,5 +1,6 @@
 """Checks of arguments: each says what was given and what is allowed."""
 
+import difflib
 import math
 from collections.abc import Iterable
 from typing import Any
@@ -9,6 +10,12 @@ def choice(name: str, value: str, allowed: Iterable[str]) -> None:
     """Raise unless `value` is one of `allowed`."""
     if value not in allowed:
         raise ValueError(f"{name} is {value!r}: it must be one of {', '.join(sorted(allowed))}")
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """` (did you mean …?)` with the nearest of the known names, or nothing."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def at_least(name: str, value: Any, minimum: float) -> None:

@@ -7,7 +7,6 @@ alone (`trust=False`).
 """
 
 import dataclasses
-import difflib
 import functools
 import importlib
 import importlib.metadata
@@ -38,6 +37,7 @@ from ..learners.manager import AbstractManager
 from ..networks.base import AbstractNetwork
 from ..networks.exploration import AbstractNoise
 from ..networks.mlp import AbstractCritic
+from ..require import suggestion
 from . import files
 
 EXTENSIONS = (
@@ -234,12 +234,6 @@ def find_class(name: str) -> type:
         # A stored name must not be able to call an arbitrary class of the machine.
         raise ConfigError(f"{name!r} is neither Credo's nor one of the kinds that extend it")
     return cls
-
-
-def suggestion(name: str, known: list[str]) -> str:
-    """' (did you mean …?)', or nothing."""
-    close = difflib.get_close_matches(name, known, n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def differences(a: Any, b: Any, path: str = "") -> list[str]:

@@ -1,0 +1,84 @@
+"""How a run is run: its budget, what it writes and who listens. Declared here and nowhere else."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+from .. import require
+from .callbacks import Callback
+
+LARGEST = 2**63 - 1
+
+
+@dataclasses.dataclass(frozen=True)
+class RunOptions:
+    """Everything about a run that changes no bit of a generation.
+
+    The same record serves Python, the command line, the processes of several runs and `config.json`.
+    Raises `ValueError` for a value outside its range.
+    """
+
+    generations: int | None = None
+    """Budget in generations, at least 1: the run ends after this one. None: no such limit; with
+    neither a limit of generations nor one of frames, the algorithm's own budget, or 1000
+    generations."""
+
+    frames: int | None = None
+    """Budget in environment steps of everything that plays, at least 1, such as 1e6: the run ends
+    after the first generation that reaches it. None: no such limit."""
+
+    stop_at: float | None = None
+    """Champion score, in the task's own units, at which the run ends early. None: never."""
+
+    wall_clock: float | None = None
+    """Seconds of training after which to save and end, at least 0. None: no limit."""
+
+    checkpoint_every: float = 60.0
+    """Seconds between two checkpoints, at least 0; 0: after every dispatch."""
+
+    keep: int = 3
+    """Checkpoints that stay on disk, at least 1. With 2 or more, two copies of a replay buffer do."""
+
+    tensorboard: bool = True
+    """Whether to write TensorBoard events, into `tensorboard/` of the run's folder."""
+
+    loggers: tuple[Literal["wandb", "trackio"], ...] = ()
+    """Experiment trackers that get every metric: wandb, trackio. Each is a package of its own, as in
+    `pip install "credo[wandb]"`."""
+
+    progress: bool = True
+    """Whether to show a progress bar, or a line every ten seconds where there is no terminal."""
+
+    callbacks: tuple[Callback | Callable[..., Any], ...] = ()
+    """Objects that hear of every generation, test and end (see `credo.Callback`); a plain function
+    `f(run, generation, metrics)` stands for `on_generation`. From Python alone: they are neither
+    recorded nor sent to the processes of several runs."""
+
+    def __post_init__(self):
+        for name in ("generations", "frames"):
+            value = getattr(self, name)
+            if value is not None:
+                require.within(name, value, 1, LARGEST)
+                object.__setattr__(self, name, int(value))  # 1e6 is what people write
+        for name in ("wall_clock", "checkpoint_every"):
+            require.at_least(name, getattr(self, name), 0)
+        if self.stop_at is not None and math.isnan(self.stop_at):
+            raise ValueError("stop_at is nan: give a champion score, or None to stop at none")
+        require.at_least("keep", self.keep, 1)
+        for name in self.loggers:
+            require.choice("loggers", name, ("wandb", "trackio"))
+
+    def changed(self, changes: dict[str, Any]) -> "RunOptions":
+        """These options with others in the place of some. Raises `TypeError` for an unknown name."""
+        known = [field.name for field in dataclasses.fields(self)]
+        for name in changes:
+            if name not in known:
+                raise TypeError(f"a run has no option {name!r}{require.suggestion(name, known)}")
+        return dataclasses.replace(self, **changes)
+
+    def record(self) -> dict[str, Any]:
+        """As JSON: all but what only this process knows."""
+        told = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        del told["callbacks"]
+        return told | {"loggers": list(self.loggers)}
