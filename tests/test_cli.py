@@ -21,7 +21,9 @@ from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Meet, Remember
 from credo.networks.mlp import MLP
 from credo.networks.team import Team
-from credo.runs.loop import Interrupted, Run, RunError
+from credo.runs.loop import Interrupted
+from credo.runs.record import RunError
+from credo.runs.store import Run
 
 TRAIN = (
     "train neuroevolution sequence-classification --depth 2 --min-gap 1 --max-gap 2 "
@@ -453,7 +455,7 @@ def test_of_a_folder_of_runs_one_must_be_named(credo, seeds, command):
 
 def test_every_run_of_a_folder_is_resumed(credo, seeds, monkeypatch):
     given = []
-    monkeypatch.setattr("credo.runs.executor.run", lambda jobs, **_: given.extend(jobs))
+    monkeypatch.setattr("credo.executors.local.run", lambda jobs, **_: given.extend(jobs))
     assert credo(f"resume {seeds} --generations 20 --keep 2")[0] == 0
     assert [(job.path.name, job.seed) for job in given] == [("seed-3", 3), ("seed-11", 3)]
     assert [(job.generations, job.frames, job.keep) for job in given] == [(20, None, 2)] * 2

@@ -15,6 +15,7 @@ LEVELS = [
     {"algorithms"},
     {"analysis"},
     {"runs"},
+    {"executors"},
     {"report"},
     {"experiments"},
     {"cli"},

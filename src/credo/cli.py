@@ -399,22 +399,36 @@ def _label(algorithm: str, task: str) -> str:
     return f"{algorithm}-{task.rpartition(':')[2]}"
 
 
-def _start(algorithm: Any, label: str, *, seed: int, seeds: int, path: str | None, **options: Any):
+def _start(
+    algorithm: Any,
+    label: str,
+    *,
+    seed: int,
+    seeds: int,
+    path: str | None,
+    warm_start: str | None,
+    **fields: Any,
+):
     """One run here, or several in processes of their own."""
-    from .runs import executor, loop
+    from .executors import local
+    from .runs import loop
+    from .runs.options import RunOptions
+    from .runs.store import Run
 
+    options = RunOptions(**fields)
     if seeds == 1:
         folder = path or loop.free_name(algorithm, seed, label)
-        print(_summary(loop.train(algorithm, seed=seed, path=folder, **options)))
+        start = {"seed": seed, "path": folder, "warm_start": warm_start}
+        print(_summary(loop.train(algorithm, options, **start)))
         return
     base = pathlib.Path(path) if path else loop.free_name(algorithm, "seeds", label)
     jobs = [
-        executor.Job(base / f"seed-{s}", algorithm, seed=s, **options)
+        local.Job(base / f"seed-{s}", algorithm, s, options, warm_start)
         for s in range(seed, seed + seeds)
     ]
-    executor.run(jobs)
+    local.run(jobs)
     for job in jobs:
-        print(_summary(loop.Run(job.path)))
+        print(_summary(Run(job.path)))
     print(f"compare them: credo report {base}/seed-*")
 
 
@@ -454,9 +468,10 @@ def _resume(argv: list[str]) -> None:
 
 def _require_changes(path: pathlib.Path, changes: dict[str, Any], trust: bool) -> None:
     """End if an algorithm has no such fields, or none with such values: nothing was begun yet."""
-    from .runs import config, loop
+    from .runs import config
+    from .runs.store import Run
 
-    algorithm = loop.Run(path, trust=trust).algorithm
+    algorithm = Run(path, trust=trust).algorithm
     try:
         config.replaced(algorithm, changes)
     except ValueError as error:
@@ -500,11 +515,12 @@ def _evaluated(run: Any, argv: list[str]) -> list[Any]:
 def _evaluate(argv: list[str]) -> None:
     path, argv = _positional(argv, "evaluate RUN", "the run's folder, or one with runs in it")
     trust, argv = pop_switch(argv, "--trust")
-    from .runs import evaluation, loop
+    from .runs import evaluation
+    from .runs.store import Run
 
     results = []
     for each in _runs(path):
-        run = loop.Run(each, trust=trust)
+        run = Run(each, trust=trust)
         task, options = _evaluated(run, argv)
         lines, result = evaluation.describe(run, task, options.episodes, options.seed)
         print("\n".join(lines))
@@ -534,9 +550,9 @@ def _watch(argv: list[str]) -> None:
     (options,) = parse("credo watch RUN [FILE]", None, WatchOptions, argv, popped=("--trust",))
     in_range(options, options.episodes)
     from .report import watch
-    from .runs import loop
+    from .runs.store import Run
 
-    run = loop.Run(_one_run("watch", path), trust=trust)
+    run = Run(_one_run("watch", path), trust=trust)
     target = pathlib.Path(film) if film else None
     print(f"wrote {watch.watch(run, target, **vars(options))}")
 
@@ -549,9 +565,10 @@ def _export(argv: list[str]) -> None:
         print("  the champion for credo.runner, without JAX; --trust: the run was made elsewhere")
         print("  and names code of somebody's own: import it")
         raise SystemExit(0 if argv in (["-h"], ["--help"]) else 2)
-    from .runs import export, loop
+    from .runs import export
+    from .runs.store import Run
 
-    run = loop.Run(_one_run("export", path), trust=trust)
+    run = Run(_one_run("export", path), trust=trust)
     target = argv[0] if argv else run.path / "policy.safetensors"
     print(f"policy: {export.export(run, pathlib.Path(target))}")
 
@@ -799,9 +816,9 @@ def _positional(argv: list[str], usage: str, what: str) -> tuple[str, list[str]]
 
 def _runs(path: str | pathlib.Path) -> list[pathlib.Path]:
     """The run that is this folder, or those that lie in it, as `--seeds` leaves them."""
-    from .runs import loop
+    from .runs import folder
 
-    return loop.runs_in(pathlib.Path(path))
+    return folder.runs_in(pathlib.Path(path))
 
 
 def _one_run(command: str, path: str) -> pathlib.Path:
@@ -814,28 +831,29 @@ def _one_run(command: str, path: str) -> pathlib.Path:
     return runs[0]
 
 
-def _go_on(base: pathlib.Path, runs: list[pathlib.Path], **fields: Any) -> None:
-    """Go on with a run, or with several in processes of their own; with options that other
-    processes are not told, one after the other."""
-    from .runs import executor, loop
+def _go_on(
+    base: pathlib.Path,
+    runs: list[pathlib.Path],
+    *,
+    set: dict[str, Any],
+    trust: bool,
+    without_replay: bool,
+    **fields: Any,
+) -> None:
+    """Go on with a run, or with several in processes of their own."""
+    from .executors import local
+    from .runs import loop
+    from .runs.options import RunOptions
+    from .runs.store import Run
 
-    if len(runs) == 1 or fields["set"] or fields["trust"] or fields["without_replay"]:
-        for path in runs:
-            print(_summary(loop.resume(path, **fields)))
-        return
-    told = {name: fields[name] for name in ("wall_clock", "checkpoint_every", "keep")}
-    jobs = []
+    options = RunOptions(**fields)
+    again: Any = {"set": set, "trust": trust, "without_replay": without_replay}
+    if len(runs) == 1:
+        loop.resume(runs[0], options, **again)
+    else:
+        local.run([local.Job.resumed(path, options, **again) for path in runs], title=base.name)
     for path in runs:
-        record = loop.Run(path).config
-        budget = {name: fields[name] for name in ("generations", "frames", "stop_at")}
-        if budget["generations"] is budget["frames"] is None:
-            stop_at = budget["stop_at"]
-            budget = record["budget"] | ({} if stop_at is None else {"stop_at": stop_at})
-        again = {"seed": record["seed"], "warm_start": record.get("warm_start")}
-        jobs.append(executor.Job(path, record["algorithm"], **budget, **again, **told))
-    executor.run(jobs, title=base.name)
-    for path in runs:
-        print(_summary(loop.Run(path)))
+        print(_summary(Run(path, trust=trust)))
 
 
 def _summary(run: Any) -> str:

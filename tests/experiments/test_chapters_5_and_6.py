@@ -21,7 +21,7 @@ from credo.report import page
 from credo.report import run_page as report
 from credo.rollout import evaluate
 from credo.runs import checkpoint, config, log
-from credo.runs.loop import Run
+from credo.runs.store import Run
 
 OTHERS = ("3.", "3", "4.", "4", "7.", "7", "sp")  # chapters 3, 4 and 7
 NAMES = [name for name in base.MODULES if name.partition("-")[2][:2] not in OTHERS]

@@ -14,11 +14,14 @@ from credo.algorithms.bptt import BPTT
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
+from credo.executors import local
 from credo.experiments import base, chapter3, fig_3_4a
 from credo.networks.mmu import MMU
 from credo.report import page
-from credo.runs import config, executor
-from credo.runs.loop import Run, RunError, train
+from credo.runs import config
+from credo.runs.loop import train
+from credo.runs.record import RunError
+from credo.runs.store import Run
 
 BUDGETS = base.BUDGETS
 CHAPTER3 = [name for name in base.MODULES if name.partition("-")[2].startswith("3.")]
@@ -131,7 +134,7 @@ def test_a_budget_that_an_experiment_lacks_is_named(tmp_path):
 
 def test_some_cells_alone(tmp_path, monkeypatch):
     chosen = []
-    monkeypatch.setattr(executor, "run", lambda jobs, *_, **__: chosen.extend(jobs))
+    monkeypatch.setattr(local, "run", lambda jobs, *_, **__: chosen.extend(jobs))
     monkeypatch.setattr(base, "Run", lambda path: path)
     monkeypatch.setattr(fig_3_4a, "measure", lambda runs, budget: dict.fromkeys(runs, 1))
     monkeypatch.setattr(fig_3_4a, "sections", lambda measured: [])
@@ -333,7 +336,7 @@ def test_reproduce_trains_once_and_repeats_itself(tmp_path, monkeypatch):
     def refuse(core):
         raise AssertionError("what is finished was trained again")
 
-    monkeypatch.setattr(executor, "_start", refuse)
+    monkeypatch.setattr(local, "_start", refuse)
     base.reproduce("fig-3.4a", "smoke", runs=1, jobs=1, **folders)
     assert results.read_bytes() == before
     assert html.read_bytes() == page_before

@@ -16,7 +16,7 @@ from credo.networks.team import Team
 from credo.report import maze_page, page
 from credo.report.watch import watch
 from credo.runs import checkpoint, config
-from credo.runs.loop import Run
+from credo.runs.store import Run
 
 ENV = ExtendedTMaze(depth=1, robots=2, objective="spread")
 NETWORK = MMU(hidden=3, output_activation="tanh")

@@ -26,7 +26,8 @@ from credo.report import replay_page, trajectories
 from credo.report.watch import watch
 from credo.rollout import evaluate
 from credo.runs import checkpoint, config
-from credo.runs.loop import Run, RunError
+from credo.runs.record import RunError
+from credo.runs.store import Run
 
 ENV = Rover(coupling=2, rovers=3, pois=2, size=8.0, max_steps=9)
 NETWORK = Team(trunk=(4,), head=Recurrent("gru", 3))

@@ -18,7 +18,9 @@ from credo.networks.mmu import MMU
 from credo.report import run_page as report
 from credo.report.page import Page
 from credo.runs import config, evaluation, log
-from credo.runs.loop import Run, RunError, train
+from credo.runs.loop import train
+from credo.runs.record import RunError
+from credo.runs.store import Run
 from credo.types import Evaluation
 
 TASK = SequenceClassification(depth=2, min_gap=1, max_gap=2)

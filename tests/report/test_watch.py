@@ -25,7 +25,8 @@ from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team
 from credo.report.watch import _maker, _takes, _write_mp4, watch
 from credo.runs import checkpoint, config
-from credo.runs.loop import Run, RunError
+from credo.runs.record import RunError
+from credo.runs.store import Run
 from credo.types import TimeStep
 
 LENGTH = 6
@@ -371,7 +372,7 @@ HOPPER = """
 import sys, pathlib
 from credo.environments.gymnasium import Gymnasium
 from test_watch import made
-from credo.runs.loop import RunError
+from credo.runs.record import RunError
 from credo.report.watch import watch
 folder = pathlib.Path(sys.argv[1])
 run = made(folder / "run", Gymnasium("Hopper-v5", max_episode_steps=9, in_process=True))

@@ -182,16 +182,17 @@ def disturb(
     return f"{how} after {time.monotonic() - began:.2f} s, newest checkpoint {saved[-1:] or 'none'}"
 
 
+def content(path: pathlib.Path) -> bytes | None:
+    return path.read_bytes() if path.exists() else None
+
+
 def different(a: pathlib.Path, b: pathlib.Path) -> list[str]:
     """Files that are not the same bytes in both runs."""
     newest = sorted(p.name for p in (a / "checkpoints").glob("[0-9]*"))[-1]
     names = ["metrics.csv", "champion.safetensors", "config.json"]
+    names += ["best.safetensors"] * any((run / "best.safetensors").exists() for run in (a, b))
     names += [f"checkpoints/{newest}/{p.name}" for p in (a / "checkpoints" / newest).iterdir()]
-    return [
-        name
-        for name in names
-        if not (b / name).exists() or (a / name).read_bytes() != (b / name).read_bytes()
-    ]
+    return [name for name in names if content(a / name) != content(b / name)]
 
 
 def compare(

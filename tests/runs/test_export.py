@@ -24,8 +24,9 @@ from credo.networks.team import Centralized, Team
 from credo.runner import DESCRIPTION, VERSION, Runner
 from credo.runs import checkpoint, config
 from credo.runs.export import export, parts_of
-from credo.runs.loop import Run, RunError
 from credo.runs.policy import Policy
+from credo.runs.record import RunError
+from credo.runs.store import Run
 
 STEPS = 60
 NETWORKS = [

@@ -45,7 +45,7 @@ def resume(path, **options):
 
 def contents(path) -> dict[str, bytes]:
     newest = max((path / "checkpoints").glob("[0-9]*"))
-    names = ["metrics.csv", "champion.safetensors"]
+    names = ["metrics.csv", "champion.safetensors", "best.safetensors"]
     kept = {name: (path / name).read_bytes() for name in names}
     return kept | {file.name: file.read_bytes() for file in newest.iterdir()}
 
@@ -156,13 +156,13 @@ def test_a_setting_that_makes_generations_longer_has_its_buffer(bounded, tmp_pat
 def test_weights_that_are_no_numbers_end_the_run(tmp_path, monkeypatch, what, value):
     play = loop.play
 
-    def spoiled(algorithm, state, root, generation, *rest):
-        state, batch = play(algorithm, state, root, generation, *rest)
+    def spoiled(algorithm, state, best, root, generation, *rest):
+        state, best, rows = play(algorithm, state, best, root, generation, *rest)
         if generation >= 1:  # the second dispatch
             of = (lambda s: s.learner.actor) if what == "learner" else (lambda s: s.champion)
             bad = jax.tree.map(lambda x: x.at[0].set(value), eqx.filter(of(state), eqx.is_array))
             state = eqx.tree_at(of, state, eqx.combine(bad, of(state)))
-        return state, batch
+        return state, best, rows
 
     monkeypatch.setattr(loop, "play", spoiled)
     words = {"learner": "the actor of the learner", "champion": "the champion"}[what]

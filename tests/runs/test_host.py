@@ -18,10 +18,12 @@ from credo.environments.host import (
     EnvironmentFailure,
     HostStep,
 )
+from credo.executors import local
 from credo.networks.base import AbstractNetwork
 from credo.networks.mlp import MLP
-from credo.runs import config, executor, loop
+from credo.runs import config, loop
 from credo.runs.checkpoint import read_metadata
+from credo.runs.options import RunOptions
 
 QUIET = {"tensorboard": False, "progress": False}
 
@@ -207,7 +209,9 @@ def test_metrics_are_those_of_generations_played_by_hand(straight):
 
 def test_stopped_and_resumed_is_bit_for_bit_the_straight_run(straight, tmp_path):
     for stop in (1, 5):
-        train(tmp_path / "run", generations=BUDGET, callback=lambda g, _, stop=stop: g >= stop)
+        train(
+            tmp_path / "run", generations=BUDGET, callbacks=(lambda _, g, m, stop=stop: g >= stop,)
+        )
         assert newest(tmp_path / "run").name == f"{stop:08}"
         resume(tmp_path / "run")
         assert contents(tmp_path / "run") == contents(straight)
@@ -274,16 +278,20 @@ def test_a_failing_environment_leaves_the_last_checkpoint(straight, tmp_path, mo
 
 
 def test_a_signal_ends_after_the_generation(straight, tmp_path):
-    def interrupt(generation, metrics):
+    def interrupt(run, generation, metrics):
         if generation == 3:
             signal.raise_signal(signal.SIGINT)
 
     with pytest.raises(loop.Interrupted, match="generation 3, 30 of 120 frames, and saved") as stop:
-        train(tmp_path / "run", frames=120, callback=interrupt)
+        train(tmp_path / "run", frames=120, callbacks=(interrupt,))
     assert stop.value.code == 130
     resume(tmp_path / "run")
     ended, whole = contents(tmp_path / "run"), contents(straight)
-    sealed = [name for name in whole if name.endswith(("COMMIT", "champion.safetensors"))]
+    sealed = [
+        name
+        for name in whole
+        if name.endswith(("COMMIT", "champion.safetensors", "best.safetensors"))
+    ]
     for name in sealed:  # they tell the budgets apart: frames here, generations there
         assert ended.pop(name) != whole.pop(name)
     assert ended == whole
@@ -316,7 +324,7 @@ def test_a_warm_start_begins_with_the_champion_of_another_run(straight, tmp_path
 
 def test_a_job_has_a_budget_of_frames(straight, tmp_path):
     path = tmp_path / "run"
-    job = executor.Job(path, ALGORITHM, None, 0, frames=40)
+    job = local.Job(path, ALGORITHM, 0, RunOptions(frames=40))
     assert not job.finished()
     train(path, frames=30)
     assert not job.finished()
@@ -324,10 +332,10 @@ def test_a_job_has_a_budget_of_frames(straight, tmp_path):
     resume(path, frames=40)
     assert job.finished()
     assert read_metadata(path / "champion.safetensors")["generation"] == "4"
-    assert executor.Job(path, ALGORITHM, None, 0).finished()  # the algorithm's own budget
+    assert local.Job(path, ALGORITHM, 0, RunOptions()).finished()  # the algorithm's own budget
     with pytest.raises(loop.RunError, match="frames: 40 != 30"):
-        executor.Job(path, ALGORITHM, None, 0, frames=30).finished()
+        local.Job(path, ALGORITHM, 0, RunOptions(frames=30)).finished()
     with pytest.raises(loop.RunError, match="frames: 40 != None"):
-        executor.Job(path, ALGORITHM, 100, 0).finished()
+        local.Job(path, ALGORITHM, 0, RunOptions(generations=100)).finished()
     with pytest.raises(loop.RunError, match="warm start: None != other"):
-        executor.Job(path, ALGORITHM, None, 0, warm_start="other").finished()
+        local.Job(path, ALGORITHM, 0, RunOptions(), warm_start="other").finished()

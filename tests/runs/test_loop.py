@@ -50,7 +50,7 @@ def resume(path, **options):
 
 def until(generation):
     """A callback that stops there. The dispatch that it falls in is finished first."""
-    return lambda g, metrics: g >= generation
+    return (lambda run, g, metrics: g >= generation,)
 
 
 def checkpoints(path) -> list[pathlib.Path]:
@@ -60,7 +60,8 @@ def checkpoints(path) -> list[pathlib.Path]:
 def contents(path) -> dict[str, bytes]:
     """What a rerun repeats bit for bit."""
     newest = checkpoints(path)[-1]
-    files = [path / "metrics.csv", path / "champion.safetensors", *newest.iterdir()]
+    names = ("metrics.csv", "champion.safetensors", "best.safetensors")
+    files = [*(path / name for name in names), *newest.iterdir()]
     return {str(file.relative_to(path)): file.read_bytes() for file in files}
 
 
@@ -84,7 +85,7 @@ def straight(tmp_path_factory):
 def stopped(straight, tmp_path):
     """A run stopped half-way."""
     path = tmp_path / "stopped"
-    train(path, callback=until(4), checkpoint_every=0.0, keep=100)
+    train(path, callbacks=until(4), checkpoint_every=0.0, keep=100)
     assert 4 <= int(checkpoints(path)[-1].name) < BUDGET
     return path
 
@@ -128,7 +129,7 @@ def test_stopped_and_resumed_is_bit_for_bit_the_straight_run(straight, stopped):
 
 def test_resuming_a_finished_run_changes_nothing_and_says_so(straight, capsys):
     before = contents(straight)
-    options = {"progress": True, "callback": lambda *_: pytest.fail("trained")}
+    options = {"progress": True, "callbacks": (lambda *_: pytest.fail("trained"),)}
     assert resume(straight, **options).path == straight
     assert contents(straight) == before
     assert capsys.readouterr().err == (
@@ -177,11 +178,14 @@ def test_a_budget_of_generations_has_no_limit_of_frames():
     """Frames are counted beyond what 32 bits hold."""
     state = loop._initial(ALGORITHM, jax.random.key(0))
     seen, budget = 2**31 + 5, loop.Budget(generations=2)
-    state, batch = loop.play(ALGORITHM, state, jax.random.key(0), 0, seen, 2, budget)
+    best = loop.Best.none(eqx.filter(state.champion, eqx.is_array))
+    state, best, batch = loop.play(ALGORITHM, state, best, jax.random.key(0), 0, seen, 2, budget)
     assert [row["generation"] for row in batch] == [1, 2]
     assert batch[0]["frames"] > seen
     budget = loop.Budget(frames=batch[1]["frames"] + 1)
-    _, more = loop.play(ALGORITHM, state, jax.random.key(0), 2, batch[1]["frames"], 2, budget)
+    _, _, more = loop.play(
+        ALGORITHM, state, best, jax.random.key(0), 2, batch[1]["frames"], 2, budget
+    )
     assert [row["generation"] for row in more] == [3]
 
 
@@ -197,7 +201,7 @@ def test_a_run_of_an_older_version_knows_no_frames_optax_task_or_signature(stopp
 
 
 def test_without_a_budget_neuroevolution_has_a_thousand_generations(tmp_path):
-    run = train(tmp_path / "run", generations=None, callback=until(1))
+    run = train(tmp_path / "run", generations=None, callbacks=until(1))
     assert run.config["budget"] == {"generations": 1000, "frames": None, "stop_at": None}
 
 
@@ -205,7 +209,8 @@ def test_the_memory_of_a_state_is_used_again():
     state = loop._initial(ALGORITHM, jax.random.key(0))
     before = jax.tree.leaves(eqx.filter(state, eqx.is_array))
     budget = loop.Budget(generations=1)
-    state, _ = loop.play(ALGORITHM, state, jax.random.key(0), 0, 0, 1, budget)
+    best = loop.Best.none(eqx.filter(state.champion, eqx.is_array))
+    state, _, _ = loop.play(ALGORITHM, state, best, jax.random.key(0), 0, 0, 1, budget)
     assert all(leaf.is_deleted() for leaf in before)
     assert np.isfinite(jax.tree.leaves(state.population)[0]).all()
 
@@ -246,14 +251,14 @@ def test_wall_clock_saves_and_ends(straight, tmp_path):
     run = train(tmp_path / "run", generations=10**6, wall_clock=0.0)
     assert run.metrics["generation"].tolist() == [1]
     assert checkpoints(run.path)[-1].name == "00000001"
-    resume(run.path, callback=until(BUDGET))
+    resume(run.path, callbacks=until(BUDGET))
     rows = (tmp_path / "run" / "metrics.csv").read_text().splitlines()
     assert rows[: BUDGET + 1] == (straight / "metrics.csv").read_text().splitlines()
 
 
 def test_the_callback_sees_every_generation_once_in_order(straight, tmp_path):
     seen = []
-    train(tmp_path / "run", callback=lambda g, metrics: seen.append((g, metrics["fitness_mean"])))
+    train(tmp_path / "run", callbacks=(lambda _, g, m: seen.append((g, m["fitness_mean"])),))
     assert [g for g, _ in seen] == list(range(1, BUDGET + 1))
     logged = loop.Run(straight).metrics["fitness_mean"]
     np.testing.assert_array_equal(np.float32([f for _, f in seen]), logged.astype(np.float32))
@@ -281,7 +286,7 @@ def test_a_second_process_is_refused_and_harms_nothing(straight, tmp_path):
     script = f"from credo.runs import loop; loop.resume({str(tmp_path / 'run')!r}, generations=999)"
     answers = []
 
-    def intrude(generation, metrics):
+    def intrude(run, generation, metrics):
         if generation == 2:
             before = contents(tmp_path / "run")
             other = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
@@ -289,7 +294,7 @@ def test_a_second_process_is_refused_and_harms_nothing(straight, tmp_path):
             with pytest.raises(RunLocked):
                 resume(tmp_path / "run")
 
-    train(tmp_path / "run", checkpoint_every=0.0, callback=intrude)
+    train(tmp_path / "run", checkpoint_every=0.0, callbacks=(intrude,))
     ((code, told, unharmed),) = answers
     assert code == 1
     assert f"RunLocked: {tmp_path / 'run'} is in use by process {os.getpid()}" in told
@@ -333,7 +338,7 @@ def test_with_every_checkpoint_damaged_nothing_is_retrained(stopped):
         flip_a_bit(folder)
     before = contents(stopped)
     with pytest.raises(CheckpointError, match="no intact checkpoint"):
-        resume(stopped, callback=lambda *_: pytest.fail("trained"))
+        resume(stopped, callbacks=(lambda *_: pytest.fail("trained"),))
     assert contents(stopped) == before
 
 
@@ -357,7 +362,9 @@ def largest_file(size):
 def test_a_full_disk_spares_the_older_checkpoints(straight, tmp_path):
     size = (checkpoints(straight)[-1] / "state.safetensors").stat().st_size
     with largest_file(size - 1) as fill, pytest.raises(CheckpointError, match="cannot save"):
-        train(tmp_path / "run", checkpoint_every=0.0, callback=lambda g, m: g >= 4 and fill())
+        train(
+            tmp_path / "run", checkpoint_every=0.0, callbacks=(lambda _, g, m: g >= 4 and fill(),)
+        )
     saved = checkpoints(tmp_path / "run")
     assert 1 <= int(saved[-1].name) <= 4
     assert [damage(folder) for folder in saved] == [None] * len(saved)
@@ -369,7 +376,7 @@ def test_a_disk_too_full_for_metrics_says_so_and_the_run_goes_on_later(straight,
     whole = (straight / "metrics.csv").read_bytes()
     size = len(b"".join(whole.splitlines(keepends=True)[:100])) + 7  # a part of row 100
     with largest_file(size) as fill, pytest.raises(OSError, match=r"free some space.*metrics\.csv"):
-        train(tmp_path / "run", callback=lambda g, m: g >= 3 and fill())
+        train(tmp_path / "run", callbacks=(lambda _, g, m: g >= 3 and fill(),))
     left = (tmp_path / "run" / "metrics.csv").read_bytes()
     assert (whole.startswith(left), left[-1:], len(left) < size) == (True, b"\n", True)
     resume(tmp_path / "run")
@@ -419,7 +426,7 @@ def test_a_signal_saves_and_says_how_to_go_on(tmp_path, number, code):
     assert told
     assert "Traceback" not in output
     assert int(checkpoints(path)[-1].name) == int(told[1]) >= 1
-    resume(path, callback=until(int(told[1]) + 5))
+    resume(path, callbacks=until(int(told[1]) + 5))
     end = int(loop.Run(path).metrics["generation"][-1])
     assert end >= int(told[1]) + 5
     alone = tmp_path / "alone"
@@ -465,7 +472,7 @@ def test_nothing_compiles_once_the_loop_runs(tmp_path):
             generations=200,
             seed=5,
             checkpoint_every=0.0,
-            callback=lambda g, _: at.setdefault(g, len(events)) and None,
+            callbacks=(lambda run, g, _: at.setdefault(g, len(events)) and None,),
         )
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)

@@ -21,7 +21,9 @@ from credo.runner import Runner
 from credo.runs import checkpoint, config
 from credo.runs.config import ConfigError
 from credo.runs.export import export
-from credo.runs.loop import Policy, Run, RunError
+from credo.runs.policy import Policy
+from credo.runs.record import RunError
+from credo.runs.store import Run
 
 OBS, ACTIONS = 3, 2
 BOX = {"low": [-3.0, 10.0], "high": [1.0, 30.0], "shape": [2, 1], "dtype": "float32"}

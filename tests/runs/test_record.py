@@ -9,7 +9,9 @@ from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.probes import Copy
 from credo.networks.mmu import MMU
 from credo.runs import config, record, trust
-from credo.runs.loop import Run, RunError, runs_in
+from credo.runs.folder import runs_in
+from credo.runs.record import RunError
+from credo.runs.store import Run
 
 TREE = json.loads(json.dumps(config.to_tree(Neuroevolution(Copy(), MMU(hidden=2)))))
 MACHINE = {"versions": {"jax": "1"}, "processor": "p", "cores": 2, "device": "cpu", "system": "s"}

@@ -12,7 +12,7 @@ from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy
 from credo.networks.mmu import MMU
 from credo.runs import config, record, trust
-from credo.runs.loop import Run
+from credo.runs.store import Run
 
 TREE = json.loads(json.dumps(config.to_tree(Neuroevolution(Copy(), MMU(hidden=2)))))
 SAID = {"algorithm": TREE, "seed": 3, "budget": {"generations": 5}}

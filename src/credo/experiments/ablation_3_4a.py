@@ -11,7 +11,7 @@ from ..algorithms.neuroevolution import Neuroevolution
 from ..analysis import counting
 from ..evolution.curriculum import Curriculum
 from ..report.page import Curve, Figure, Reference, Table
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter3
 from .base import Cell
 

@@ -12,9 +12,12 @@ from typing import Any, Protocol
 
 import equinox as eqx
 
+from ..executors import local
 from ..report.page import Page, write
-from ..runs import config, executor, files
-from ..runs.loop import Run, RunError
+from ..runs import config, files
+from ..runs.options import RunOptions
+from ..runs.record import RunError
+from ..runs.store import Run
 
 MODULES = {
     "fig-3.4a": "fig_3_4a",
@@ -126,9 +129,9 @@ def reproduce(
     folder = {
         cell.name: [work / budget / cell.name / str(s) for s in seeds(cell)] for cell in cells
     }
-    executor.run(
+    local.run(
         [
-            executor.Job(path, cell.algorithm, seed=seed, **limits(cell))
+            local.Job(path, cell.algorithm, seed, RunOptions(tensorboard=False, **limits(cell)))
             for cell in cells
             for seed, path in zip(seeds(cell), folder[cell.name], strict=True)
         ],
@@ -248,7 +251,7 @@ def budgets(name: str) -> tuple[str, ...]:
 
 
 def limits(cell: Cell) -> dict[str, Any]:
-    """What ends a run of this cell, by the names that a `Job` has for it."""
+    """What ends a run of this cell, by the names of `RunOptions`."""
     return {"generations": cell.generations, "frames": cell.frames, "stop_at": cell.stop_at}
 
 

@@ -17,7 +17,7 @@ from ..environments.wrappers import NoisyObservations
 from ..networks.recurrent import Recurrent
 from ..report.page import Table
 from ..rollout import evaluate
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter4, chapter4_fleet, fig_4_7
 from .base import Cell
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from ..analysis import attribution
 from ..report import run_page as report
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter5
 from .base import Cell
 

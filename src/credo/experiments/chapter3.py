@@ -16,7 +16,7 @@ from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
 from ..networks.mmu import MMU
 from ..rollout import play_sequences
-from ..runs.loop import Run
+from ..runs.store import Run
 from .base import Cell
 
 TEST = 1000  # fresh sequences for a final champion; the dissertation used 50

@@ -16,7 +16,7 @@ from ..networks.base import AbstractNetwork
 from ..networks.mmu import MMU
 from ..networks.recurrent import Recurrent
 from ..report.page import Curve, Figure
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter3, fig_3_4a
 from .base import Cell
 

@@ -19,7 +19,7 @@ from ..networks.mmu import MMU
 from ..report import maze_page
 from ..report.page import Curve, Figure, HeatMap, Reference, Table, Text, Tracks
 from ..rollout import evaluate
-from ..runs.loop import Run
+from ..runs.store import Run
 from .base import Cell
 
 BUDGETS = ("smoke", "quick", "full", "published")

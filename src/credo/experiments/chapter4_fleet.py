@@ -19,7 +19,7 @@ from ..networks.recurrent import Recurrent
 from ..networks.team import Centralized, Team
 from ..report.page import Figure, Table, Text
 from ..rollout import evaluate
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter4
 from .base import Cell
 from .chapter4 import Plan as Plan

@@ -21,7 +21,7 @@ from ..networks.exploration import Explorer, GaussianNoise
 from ..networks.mlp import MLP, ResidualCritic
 from ..report.page import Curve, Figure, Reference, Table, Text
 from ..rollout import evaluate
-from ..runs.loop import Run
+from ..runs.store import Run
 from .base import Cell
 
 BUDGETS = ("smoke", "quick", "full", "million", "published")

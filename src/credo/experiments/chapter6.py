@@ -11,7 +11,7 @@ from ..environments.gymnasium import Gymnasium
 from ..learners.td3 import TD3
 from ..report import run_page as report
 from ..report.page import Section, Table
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import beyond_5, chapter5
 from .base import Cell
 

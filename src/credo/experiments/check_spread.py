@@ -15,7 +15,7 @@ from ..networks.mlp import Critic
 from ..networks.team import JointCritic, Team
 from ..report.page import Curve, Figure, Reference, Table, Text
 from ..rollout import evaluate
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter7
 from .base import Cell
 from .chapter5 import middle

@@ -3,7 +3,7 @@
 from typing import Any
 
 from ..environments.sequence_recall import SequenceRecall
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter3, fig_3_4a, fig_3_5a
 from .base import Cell
 

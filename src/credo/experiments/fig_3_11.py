@@ -3,7 +3,7 @@
 from typing import Any
 
 from ..report.page import Curve, Figure, Reference, Table, Text
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter3, chapter3_gradient, fig_3_4a, fig_3_5a, fig_3_5b
 from .base import Cell
 from .chapter3_gradient import depth_of, learning, of_depth, of_variant, variant_of

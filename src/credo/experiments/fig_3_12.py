@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter3, chapter3_gradient, fig_3_4a, fig_3_11
 from .base import Cell
 from .chapter3_gradient import depth_of, learning, of_depth, of_variant, variant_of

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import fig_3_10, fig_3_12
 from .base import Cell
 

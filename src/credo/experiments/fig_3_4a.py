@@ -5,7 +5,7 @@ from typing import Any
 
 from ..analysis import floors
 from ..report.page import Curve, Figure, Reference, Table, Text
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter3
 from .base import Cell
 

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter3_gradient, fig_3_4a
 from .base import Cell
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..analysis import floors
 from ..report.page import Curve, Figure, Reference, Table
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter3, fig_3_4a
 from .base import Cell
 

@@ -9,7 +9,7 @@ from .. import tree
 from ..analysis import memory
 from ..environments.sequence_classification import SequenceClassification
 from ..report.page import HeatMap, Table
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter3
 from .base import Cell
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter3, fig_3_6
 from .base import Cell
 

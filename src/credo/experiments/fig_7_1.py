@@ -8,7 +8,7 @@ from ..environments.rover import Rover
 from ..evolution.mutation import MatrixMutation
 from ..networks.team import Team
 from ..report.page import Table
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter7
 from .base import Cell
 from .chapter7 import Plan

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..report import replay_page, trajectories
 from ..report.page import Drawing, Table
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter7
 from .base import Cell
 from .chapter7 import Plan

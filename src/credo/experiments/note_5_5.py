@@ -9,7 +9,7 @@ from ..algorithms.off_policy import OffPolicy
 from ..analysis import attribution
 from ..report.page import Table
 from ..runs import log
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter5
 from .base import Cell
 from .chapter5 import Plan

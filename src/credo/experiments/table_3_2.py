@@ -7,7 +7,7 @@ import numpy as np
 
 from ..analysis import counting
 from ..report.page import Table
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter3
 from .base import Cell
 

@@ -10,7 +10,7 @@ from ..analysis import fleet
 from ..environments.server_fleet import ServerFleet
 from ..networks.dmmu import DMMU
 from ..report.page import Table
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter4_fleet
 from .base import Cell
 from .chapter3 import rounded

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..analysis import attribution
 from ..report.page import Table
-from ..runs.loop import Run
+from ..runs.store import Run
 from . import chapter5
 from .base import Cell
 

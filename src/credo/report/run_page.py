@@ -19,7 +19,8 @@ from ..environments.sequence_recall import SequenceRecall
 from ..evolution.lineage import MAKERS
 from ..learners.base import AbstractLearner
 from ..runs import config
-from ..runs.loop import Run, RunError
+from ..runs.record import RunError
+from ..runs.store import Run
 from .page import Curve, Figure, Page, Reference, Section, Table
 from .page import write as write_page
 

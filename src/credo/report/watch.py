@@ -25,8 +25,9 @@ from ..environments.foreign import AbstractForeignEnvironment
 from ..environments.host import AbstractHostEnvironment
 from ..environments.rover import Rover
 from ..runs import files
-from ..runs.loop import Run, RunError
 from ..runs.policy import Policy, champion, undelayed
+from ..runs.record import RunError
+from ..runs.store import Run
 from . import maze_page, replay_page
 
 FASTEST = 50  # pictures per second: browsers slow a gif down that has more

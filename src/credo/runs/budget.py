@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import require
+from .options import RunOptions
 
 DEFAULT = {"generations": 1000}
 
@@ -19,26 +19,25 @@ class Budget:
     stop_at: float | None = None  # champion score
 
     def __post_init__(self):
-        for name in ("generations", "frames"):
-            if getattr(self, name) is not None:
-                require.within(name, getattr(self, name), 1, 2**63 - 1)
         if self.generations is None and self.frames is None:
             raise ValueError("a run needs a budget: give generations, frames or both")
 
     @classmethod
-    def of(
-        cls,
-        algorithm: Any,
-        generations: int | None = None,
-        frames: int | None = None,
-        stop_at: float | None = None,
-    ) -> "Budget":
-        """As given, or else the `default_budget` of the algorithm, an object or a class."""
-        if generations is None and frames is None:
-            return cls(**getattr(algorithm, "default_budget", DEFAULT), stop_at=stop_at)
-        # 1e6 is what people write.
-        whole = (None if x is None else int(x) for x in (generations, frames))
-        return cls(*whole, stop_at=stop_at)
+    def of(cls, algorithm: Any, options: RunOptions) -> "Budget":
+        """As the options say, or else the `default_budget` of the algorithm, an object or a
+        class."""
+        if options.generations is None and options.frames is None:
+            limits = getattr(algorithm, "default_budget", DEFAULT)
+            return cls(**limits, stop_at=options.stop_at)
+        return cls(options.generations, options.frames, options.stop_at)
+
+    def going_on(self, algorithm: Any, options: RunOptions) -> "Budget":
+        """The budget of a run with this one that is resumed with these options."""
+        if options.generations is not None or options.frames is not None:
+            return Budget.of(algorithm, options)
+        return (
+            self if options.stop_at is None else dataclasses.replace(self, stop_at=options.stop_at)
+        )
 
     @classmethod
     def read(cls, record: dict[str, Any]) -> "Budget":

@@ -16,6 +16,7 @@ from . import files, trust
 from .record import RunError
 
 if TYPE_CHECKING:
+    from .options import RunOptions
     from .store import Run
 
 Metrics = dict[str, Any]
@@ -123,12 +124,19 @@ class Trackio(Logger):
 LOGGERS: dict[str, type[Logger]] = {"wandb": WandB, "trackio": Trackio}
 
 
-def loggers(tensorboard: bool, names: Sequence[str]) -> list[Callback]:
-    """Those that options ask for. Raises `RunError` if the package of one is missing."""
-    for name in names:
+def of(options: "RunOptions") -> list[Callback]:
+    """The callbacks that options ask for, loggers first. Raises `RunError` if the package of one is
+    missing, and `TypeError` for what is no callback."""
+    heard: list[Callback] = [TensorBoard()] * options.tensorboard
+    for name in options.loggers:
         if importlib.util.find_spec(name) is None:
             raise RunError(f'{name} is not installed: pip install "credo[{name}]"')
-    return [TensorBoard()] * tensorboard + [LOGGERS[name]() for name in names]
+        heard.append(LOGGERS[name]())
+    for callback in options.callbacks:
+        if not isinstance(callback, Callback) and not callable(callback):
+            raise TypeError(f"{callback!r} is no callback: derive it from credo.Callback")
+        heard.append(callback if isinstance(callback, Callback) else OnGeneration(callback))
+    return heard
 
 
 class Listeners:
@@ -145,20 +153,21 @@ class Listeners:
         answers = []
         for row in rows:
             generation, score = row["generation"], row["champion_score"]
-            answers += self._tell("on_generation", generation, row)
+            answers += self.tell("on_generation", generation, row)
             if np.isfinite(score) and (self.every or score != self.score):
-                self._tell("on_test", generation, score)
+                self.tell("on_test", generation, score)
             self.score = score
         return any(answers) or self.error is not None
 
     def end(self, reason: str) -> None:
         """Tell of the end, then raise what a callback raised."""
-        self._tell("on_end", reason)
+        self.tell("on_end", reason)
         if self.error is not None:
             self.error.add_note(f"{self.run.path} was saved before this was raised")
             raise self.error
 
-    def _tell(self, hook: str, *what: Any) -> list[Any]:
+    def tell(self, hook: str, *what: Any) -> list[Any]:
+        """Call a hook of all callbacks; their answers."""
         answers = []
         for callback in tuple(self.callbacks):
             try:

@@ -38,6 +38,7 @@ from . import files, segments
 STATE, COUNTERS, COMMIT = "state.safetensors", "counters.json", "COMMIT"
 # Our entries in a file's metadata.
 KEYS, CHECKSUM, REPLAY = "credo.keys", "credo.sha256", "credo.replay"
+EXTRA = "extra"  # before the names of leaves besides the state's, which begin with "." or "["
 DTYPES = {
     np.dtype(dtype): code
     for dtype, code in {
@@ -74,6 +75,7 @@ class Checkpoint(eqx.Module):
     counters: dict[str, Any]
     path: Path
     seals: dict[str, Any]
+    extra: PyTree = None
 
 
 def save(
@@ -82,6 +84,7 @@ def save(
     state: PyTree,
     counters: dict[str, Any],
     *,
+    extra: PyTree = None,
     keep: int = 3,
     seals: Mapping[str, Any] = {},
 ) -> Path:
@@ -90,7 +93,8 @@ def save(
     Array leaves (JAX or NumPy, typed PRNG keys too) are kept bit for bit. All other leaves are
     not written: `load` takes them from its `like`. `counters` holds numbers, strings, lists and
     dicts; integers of any size and floats come back exactly. So do `seals`, which say what the
-    checkpoint belongs to, hashes of other files say: `load` hands them to its `check`.
+    checkpoint belongs to, hashes of other files say: `load` hands them to its `check`. `extra` is a
+    tree besides the state, which other checkpoints may lack.
 
     The rows of a `credo.replay.Replay` that older checkpoints have are not written again but
     linked (see `segments`), if there is a copy besides that of the checkpoint just before: two in
@@ -111,7 +115,7 @@ def save(
         raise ValueError(f"keep is {keep}: it must be at least 1")
     directory = Path(directory)
     folder = directory / f"{generation:08d}"
-    leaves, keys = _leaves(state)
+    leaves, keys = _leaves(state, extra)
     rings = segments.rings(state)
     for name in [name for ring in rings for name in ring.leaves]:
         del leaves[name]  # it goes to files of its own
@@ -139,6 +143,7 @@ def load(
     directory: Path,
     like: PyTree,
     *,
+    extra: PyTree = None,
     generation: int | None = None,
     without_replay: bool = False,
     check: Callable[[int, dict[str, Any]], str | None] | None = None,
@@ -150,6 +155,8 @@ def load(
     Arrays come back as JAX arrays of the same dtype and bits (never weakly typed). A replay buffer
     may have another capacity in `like` if it was never full, and all its rows fit.
 
+    - `extra`: the same as `like` of the tree besides the state, which is None if the checkpoint has
+      none.
     - `without_replay`: replay buffers come back empty, with a warning; their files may be damaged.
     - `check(generation, seals)`: what is wrong with a checkpoint of these seals, None if nothing
       is; such a checkpoint counts as damaged. Written without `seals` it has `{}`.
@@ -173,7 +180,7 @@ def load(
             reason = check(int(folder.name), _commit(folder).get("seals", {}))
         if reason is None:
             _warn_of(damaged, folder, without_replay)
-            return _loaded(folder, like, without_replay)
+            return _loaded(folder, like, extra, without_replay)
         damaged[folder.name] = reason
     reasons = "".join(f"\n  {name}: {why}" for name, why in damaged.items())
     raise CheckpointError(
@@ -197,15 +204,18 @@ def _warn_of(damaged: Mapping[str, str], used: Path, without_replay: bool) -> No
         )
 
 
-def _loaded(folder: Path, like: PyTree, without_replay: bool) -> Checkpoint:
+def _loaded(folder: Path, like: PyTree, extra: PyTree, without_replay: bool) -> Checkpoint:
     metadata, arrays = _read(folder / STATE)
+    more = {name: arrays.pop(name) for name in list(arrays) if name.startswith(EXTRA)}
     empty = segments.names(like) if without_replay else set()
     with _explained(f"cannot read {folder}", folder):
         arrays |= segments.stored(folder, metadata.get(REPLAY, "[]"))
         state = _fit(folder / STATE, like, arrays, metadata, empty)
+        more = {name.removeprefix(EXTRA): array for name, array in more.items()}
+        extra = _fit(folder / STATE, extra, more, metadata) if more and extra is not None else None
         counters = json.loads(files.read_bytes(folder / COUNTERS))
         seals = _commit(folder).get("seals", {})
-    return Checkpoint(int(folder.name), state, counters, folder, seals)
+    return Checkpoint(int(folder.name), state, counters, folder, seals, extra)
 
 
 def damage(folder: Path, *, reread: bool = True, replay: bool = True) -> str | None:
@@ -292,13 +302,14 @@ def _describe(leaf: Any) -> str:
     return f"{leaf.dtype}{list(leaf.shape)}"
 
 
-def _leaves(tree: PyTree) -> tuple[dict[str, Any], dict[str, str]]:
+def _leaves(tree: PyTree, extra: PyTree = None) -> tuple[dict[str, Any], dict[str, str]]:
     """Array leaves by name, typed keys as their data; and the generator of each typed key."""
     leaves, keys = {}, {}
-    for path, leaf in tree_flatten_with_path(tree)[0]:
+    named = [(keystr(path), leaf) for path, leaf in tree_flatten_with_path(tree)[0]]
+    more = [(EXTRA + keystr(path), leaf) for path, leaf in tree_flatten_with_path(extra)[0]]
+    for name, leaf in named + more:
         if not _is_array(leaf):
             continue
-        name = keystr(path)
         if name in leaves:
             raise CheckpointError(f"two leaves are named {name}: give them different names")
         if _is_key(leaf):

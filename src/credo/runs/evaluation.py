@@ -16,7 +16,7 @@ from ..environments.host import AbstractHostEnvironment
 from ..environments.sequence_classification import SequenceClassification
 from ..rollout import evaluate
 from ..types import Evaluation
-from .loop import Run
+from .store import Run
 
 EPISODES, HOST_EPISODES = 1000, 20  # a task outside JAX is slower by orders of magnitude
 STREAMED = 1000  # deeper sequences are streamed: memory does not grow with their length

@@ -11,8 +11,9 @@ import safetensors.numpy
 
 from ..runner import DESCRIPTION, FINGERPRINT, VERSION, Runner, fingerprint
 from . import config, files
-from .loop import Run, RunError
 from .policy import champion, task_of
+from .record import RunError
+from .store import Run
 
 Weights = dict[str, np.ndarray]
 

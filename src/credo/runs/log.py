@@ -11,13 +11,10 @@ import csv
 import hashlib
 import os
 import pathlib
-import socket
 import stat
-import struct
-import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,7 +38,7 @@ class Log:
     `elapsed`: seconds of training before, as far as `timing.csv` tells.
     """
 
-    def __init__(self, directory: pathlib.Path, generation: int, *, tensorboard: bool = True):
+    def __init__(self, directory: pathlib.Path, generation: int):
         """`generation`: how many are done; rows of later ones are removed.
 
         Raises `DamagedLog` if `metrics.csv` lacks the row of `generation`, and `OSError` if it
@@ -51,10 +48,8 @@ class Log:
         _sealed.pop(directory / METRICS, None)
         with _explained():
             _cut(directory / METRICS, generation)
-        self.clock, self.events, self.elapsed = True, None, 0.0
+        self.clock, self.elapsed = True, 0.0
         self.clock = self._spare(f"{TIMING} is no longer written", self._wind, generation)
-        if tensorboard:
-            self._spare("TensorBoard events are not written", self._begin_events, generation)
 
     def append(self, rows: Sequence[Row], seconds: float, elapsed: float):
         """`rows`: one per generation, in order; `seconds` they took together; `elapsed` so far.
@@ -69,10 +64,6 @@ class Log:
             row = dict(zip(CLOCK, [rows[-1]["generation"], elapsed, pace], strict=True))
             what = f"{TIMING} is no longer written"
             self.clock = self._spare(what, _append, self.directory / TIMING, [row])
-        if self.events is not None:
-            what = "TensorBoard events are no longer written"
-            if not self._spare(what, self.events.append, rows):
-                self.events = None
 
     def sync(self):
         """Put the rows on the disk: a checkpoint must never be ahead of them. Raises `OSError`."""
@@ -83,10 +74,6 @@ class Log:
         if self.clock and (self.directory / TIMING).exists():
             what = f"{TIMING} is no longer written"
             self.clock = self._spare(what, files.sync, self.directory / TIMING)
-
-    def close(self):
-        """Write no more events."""
-        self.events = None
 
     def _wind(self, generation: int):
         """Go on with the clock's file, or begin a new one if it is not as we write it."""
@@ -102,9 +89,6 @@ class Log:
             _warn(f"{why}; {TIMING} is begun anew: past times are lost, no result is")
             files.remove(path)
 
-    def _begin_events(self, generation: int):
-        self.events = Events(self.directory / "tensorboard", generation + 1)
-
     def _spare(self, what: str, action: Callable[..., None], *arguments: Any) -> bool:
         """Do what training can do without; whether it worked."""
         try:
@@ -113,54 +97,6 @@ class Log:
             _warn(f"{what}: {error}; training goes on")
             return False
         return True
-
-
-class Events:
-    """A file of TensorBoard events, written by the caller's thread: nothing waits for a queue, and
-    what is written can be looked at."""
-
-    def __init__(self, directory: pathlib.Path, first: int):
-        """`first`: the step from which on what earlier files say is void. Raises `OSError`."""
-        # A tenth of a second that a closed log need not pay.
-        from tensorboardX.proto import event_pb2, summary_pb2
-
-        messages: Any = event_pb2  # its names are made when it is imported
-        self.event, self.summary = messages.Event, cast(Any, summary_pb2).Summary
-        directory.mkdir(parents=True, exist_ok=True)
-        now = f"{time.time():010.0f}.{socket.gethostname()}.{os.getpid()}.{time.monotonic_ns()}"
-        self.path = directory / f"events.out.tfevents.{now}"
-        began = messages.SessionLog(status=messages.SessionLog.START)
-        first_two = [
-            self.event(file_version="brain.Event:2"),
-            self.event(step=first, session_log=began),
-        ]
-        files.write_new(self.path, self._records(first_two))
-
-    def append(self, rows: Sequence[Row]):
-        """One event for each row, with all its finite numbers. Raises `OSError`."""
-        events = []
-        for row in rows:
-            values = [
-                self.summary.Value(tag=name, simple_value=float(value))
-                for name, value in row.items()
-                if name != "generation" and np.isfinite(value)
-            ]
-            step = int(row["generation"])
-            events.append(self.event(step=step, summary=self.summary(value=values)))
-        files.append(self.path, b"".join(self._records(events)))
-
-    def _records(self, events: Sequence[Any]) -> list[bytes]:
-        """Each event as the format has it: length, its checksum, data, their checksum."""
-        from tensorboardX.record_writer import masked_crc32c
-
-        records = []
-        for event in events:
-            event.wall_time = time.time()
-            data = event.SerializeToString()
-            length = struct.pack("<Q", len(data))
-            sums = (struct.pack("<I", masked_crc32c(part)) for part in (length, data))
-            records.append(b"".join((length, next(sums), data, next(sums))))
-        return records
 
 
 # The seal of the rows that a checkpoint stands on.

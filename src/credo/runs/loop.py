@@ -1,52 +1,50 @@
-"""Training: the loop around `generation`, a run on disk, and how to come back to it.
+"""Training: the loop around `generation`, and how to come back to it.
 
 A run is a folder:
 
-    config.json          the object tree, seed, budget, versions and machine
+    config.json          the object tree, seed, budget, options, versions and machine
     metrics.csv          one row per generation; the same bits however often the run was stopped
     timing.csv           the clock, which is not
     tensorboard/         the same as events
     checkpoints/         everything needed to go on
     champion.safetensors the fittest of the last generation, with its config inside
+    best.safetensors     the champion with the highest test score so far
 """
 
-import contextlib
 import dataclasses
 import json
 import pathlib
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from .. import compilation, require
+from .. import compilation
 from ..compilation import jit
 from ..environments import processes
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..replay import Replay, shapes_alone
 from ..types import NOTHING
-from . import checkpoint, config, files, log, policy, record, screen, weights
+from . import callbacks, checkpoint, config, files, log, record, screen, weights
 from .budget import Budget, fitted, fitted_as
 from .folder import free_name, new_folder
-from .folder import runs_in as runs_in
 from .lock import lock
-from .policy import Policy
+from .options import RunOptions
 from .progress import Progress
 from .record import RunError
 from .signals import Signals
+from .store import BEST, CHAMPION, Run
 from .trust import seal, short, signed_here
 
 CHUNK = 64  # generations in one dispatch, at most
 DISPATCH = 0.3  # seconds that one dispatch should last
 MOST = 2**31 - 1  # what 32 bits hold
-
-Callback = Callable[[int, dict[str, Any]], bool | None]
 
 
 class Interrupted(RunError):
@@ -57,161 +55,71 @@ class Interrupted(RunError):
         self.code = code
 
 
-class Run:
-    """A run on disk, finished or not."""
+class Best(eqx.Module):
+    """The champion with the highest test score so far; of equal ones the first."""
 
-    def __init__(self, path: str | pathlib.Path, *, trust: bool = False):
-        """`trust`: whether classes and environments of somebody's own may be imported that a run
-        names which this user did not make. Raises `RunError`."""
-        self.path = pathlib.Path(path)
-        self.config = record.read(self.path)
-        self.trusted = trust or signed_here(self.config)
+    policy: PyTree  # its arrays alone
+    score: Float[Array, ""]  # NOTHING before the first test
+    generation: Int[Array, ""]
 
-    @property
-    def algorithm(self) -> Any:
-        """What was recorded, as an object. A team outside JAX is opened for it, no other task."""
-        tree = self.config["algorithm"]
-        with _found(self):
-            return config.from_tree(tree, trust=self.trusted, source=str(self.path))
-
-    def part(self, name: str) -> Any:
-        """A field of the recorded algorithm as an object (its `env`, `network`, `learners`), made
-        of Credo's own classes; None if somebody's own code would have to be imported for it. It
-        opens no environment."""
-        try:
-            return config.from_tree(self.config["algorithm"].get(name), trust=False)
-        except ValueError:
-            return None
-
-    @property
-    def metrics(self) -> dict[str, np.ndarray]:
-        """Columns of `metrics.csv`, one entry per generation. Raises `RunError` if it is not what
-        the newest checkpoint says it was."""
-        _verify_metrics(self)
-        return log.read(self.path / "metrics.csv")
-
-    @property
-    @compilation.float32()
-    def champion(self) -> PyTree:
-        """The policy with the highest fitness of the last generation; of a learner alone, its
-        actor. Raises `RunError` if it is another run's, or if the task has other sizes today."""
-        algorithm = self.algorithm
-        with _found(self), shapes_alone():
-            record.check_task(self.config, algorithm.env)
-            like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0)).champion
-        return _champion(self, like)
-
-    def restored(self, like: PyTree) -> PyTree:
-        """The champion, of which `like` has the structure. Raises as `champion` does."""
-        return _champion(self, like)
-
-    def policy(self, raw: bool = False) -> Policy:
-        """The champion as a plain callable, in the task's own units; `raw`: in [-1, 1]."""
-        return policy.of(self, raw)
+    @classmethod
+    def none(cls, policy: PyTree) -> "Best":
+        """Before the first test, with copies of a policy's arrays: a state is donated."""
+        return cls(jax.tree.map(np.array, policy), np.float32(NOTHING), np.int32(0))  # pyright: ignore[reportArgumentType]
 
 
 @screen.calm()
 @compilation.float32()
 def train(
     algorithm: Any,
+    options: RunOptions = RunOptions(),  # noqa: B008
     *,
-    generations: int | None = None,
-    frames: int | None = None,
     seed: int = 0,
     path: str | pathlib.Path | None = None,
     warm_start: str | pathlib.Path | None = None,
-    stop_at: float | None = None,
-    wall_clock: float | None = None,
-    checkpoint_every: float = 60.0,
-    keep: int = 3,
-    tensorboard: bool = True,
-    progress: bool = True,
-    callback: Callback | None = None,
+    **changes: Any,
 ) -> Run:
     """Start a run in an empty or new folder and train.
 
     **Arguments:**
 
-    - `generations`, `frames` (environment steps): the budget. The run ends after the first
-      generation that reaches one of them; without both, the algorithm's `default_budget`, or
-      else 1000 generations.
+    - `options`: budget, checkpoints, loggers and callbacks; `changes` are fields of it, for a short
+      call: `train(algorithm, frames=1e6)`.
     - `seed`: everything random follows from it; 0 to 2^32 - 1.
     - `path`: the run's folder; by default `runs/<algorithm>-<task>-<seed>`.
     - `warm_start`: another run, whose champion this one starts from.
-    - `stop_at`: end early once a generation's `champion_score` reaches this.
-    - `wall_clock`: seconds after which to save and end.
-    - `checkpoint_every`: seconds between checkpoints; `keep`: how many stay on disk.
-    - `callback(generation, metrics)`: called for every generation, after the dispatch it ran in;
-      return True to end. What the dispatch has run by then is kept.
 
     **Raises:** `RunError` if there is anything in the folder already, if the algorithm cannot start
     from a policy, if weights are no numbers any more, or if an environment outside JAX fails;
-    `ValueError` for a seed or a budget that cannot be; `Interrupted` after a signal.
+    `ValueError` for a seed or an option that cannot be, `TypeError` for an option that is not;
+    `Interrupted` after a signal; what a callback raised, once the run is saved.
     """
+    options = options.changed(changes)
+    heard = callbacks.of(options)
     processes.allow()
     compilation.enable_cache()
-    budget = Budget.of(algorithm, generations, frames, stop_at)
-    require.at_least("keep", keep, 1)
     if isinstance(seed, bool) or not (isinstance(seed, int) and 0 <= seed < 2**32):
         raise ValueError(f"seed is {seed}: it must be a whole number from 0 to 2^32 - 1")
-    tree = config.to_tree(algorithm)
-    config.from_tree(tree)  # what cannot be read back should fail now, not at a resume
+    said = _said(algorithm, options, seed, warm_start)
     source = None if warm_start is None else Run(warm_start)
     path = pathlib.Path(path) if path else free_name(algorithm, seed)
-    said: dict[str, Any] = {"algorithm": json.loads(json.dumps(tree)), "seed": seed}
-    said |= {"budget": budget.record(), "machine": config.machine()}
-    if prompt := config.of_a_prompt(tree):
-        said["resumable"] = False
-        warnings.warn(
-            f"{', '.join(prompt)} was defined at a prompt or in a notebook: this run can go on in "
-            "this process alone; put it into a file for one that can be resumed",
-            stacklevel=3,
-        )
-    if warm_start is not None:
-        said["warm_start"] = str(warm_start)
     with new_folder(path):
-        fit = fitted(algorithm, budget)
-        state = _initial(fit, jax.random.key(seed))
-        if source is not None:
-            state = _warm(algorithm, state, source)
-        said["task"] = config.to_tree(record.task_of(algorithm.env))
-        files.remove(path / "checkpoints")  # left by a process that died here
-        # The first checkpoint comes before the config: what has a config can be resumed.
-        arrays, seals = eqx.filter(state, eqx.is_array), {"record": seal(said)}
-        checkpoint.save(path / "checkpoints", 0, arrays, {"frames": 0}, seals=seals)
-        del state, arrays  # it may fill half of the memory, and is read back
-        record.write(path, said)
+        fit = fitted(algorithm, Budget.read(said["budget"]))
+        _begin(path, said, fit, source)
         run = Run(path, trust=True)
-        return _train(
-            run,
-            fit,
-            _load(run, fit),
-            wall_clock,
-            checkpoint_every=checkpoint_every,
-            keep=keep,
-            tensorboard=tensorboard,
-            progress=progress,
-            callback=callback,
-        )
+        return _train(run, fit, _load(run, fit), options, heard)
 
 
 @screen.calm()
 @compilation.float32()
 def resume(
     path: str | pathlib.Path,
+    options: RunOptions = RunOptions(),  # noqa: B008
     *,
     trust: bool = False,
     set: Mapping[str, Any] | None = None,
     without_replay: bool = False,
-    generations: int | None = None,
-    frames: int | None = None,
-    stop_at: float | None = None,
-    wall_clock: float | None = None,
-    checkpoint_every: float = 60.0,
-    keep: int = 3,
-    tensorboard: bool = True,
-    progress: bool = True,
-    callback: Callback | None = None,
+    **changes: Any,
 ) -> Run:
     """Go on with a run from its newest intact checkpoint, to its own budget or a larger one.
 
@@ -219,8 +127,9 @@ def resume(
     A new budget takes the place of the whole old one: with `generations` alone a limit of frames
     is dropped, and the other way round; without `stop_at` that is dropped too.
 
-    **Arguments**, beside those of `train`:
+    **Arguments:**
 
+    - `options`, `changes`: as in `train`, none of them taken from the run but its budget.
     - `trust`: as in `Run`; the run is then taken for one of this user's.
     - `set`: other numbers and strings for the algorithm from here on, by the names of its fields:
       `{"learner.actor_lr": 1e-4}`. Population, weights and replay buffer stay; config.json says
@@ -229,78 +138,176 @@ def resume(
 
     **Raises:** as `train`; `RunError` if the task or the files are not those of this run.
     """
+    options = options.changed(changes)
+    heard = callbacks.of(options)
     processes.allow()
     compilation.enable_cache()
     with lock(Run(path, trust=trust).path):  # what is no run gets no lock
         run = Run(path, trust=trust)
-        algorithm = run.algorithm
-        old = Budget.read(run.config["budget"])
-        budget = old if stop_at is None else dataclasses.replace(old, stop_at=stop_at)
-        if generations is not None or frames is not None:
-            budget = Budget.of(algorithm, generations, frames, stop_at)
-        # A smaller budget is refused, but only once it is known how far the run is. A setting may
-        # make generations longer: the buffer must hold what either plays.
-        settings = (algorithm, config.replaced(algorithm, dict(set or {})))
-        fit = max(
-            (fitted(one, limit) for one in settings for limit in (old, budget)),
-            key=lambda one: getattr(one, "replay_capacity", 0),
-        )
-        if set:
-            fit = fitted_as(algorithm, fit)
-        with _found(run):
-            record.check_task(run.config, algorithm.env)
-            saved = _load(run, fit, without_replay)
-        try:
-            budget.refuse_smaller(old, saved.generation, int(saved.counters["frames"]))
-        except ValueError as error:
-            raise RunError(str(error)) from None
-        for change in run.config.get("changes", []):  # of an older checkpoint it begins earlier
-            change["generation"] = min(change["generation"], saved.generation)
-        fit = _changed(run, fit, set or {}, saved.generation)
-        _record_budget(run, old, budget, saved.generation)
+        fit, saved = _reopened(run, options, dict(set or {}), without_replay)
         if run.config != record.read(run.path) or (trust and not signed_here(run.config)):
             record.write(run.path, run.config, sign=run.trusted)
         _warn_of_other_machine(run.config["machine"])
-        return _train(
-            run,
-            fit,
-            saved,
-            wall_clock,
-            checkpoint_every=checkpoint_every,
-            keep=keep,
-            tensorboard=tensorboard,
-            progress=progress,
-            callback=callback,
+        return _train(run, fit, saved, options, heard)
+
+
+# How a run begins.
+
+
+def _said(
+    algorithm: Any, options: RunOptions, seed: int, warm_start: str | pathlib.Path | None
+) -> dict[str, Any]:
+    """The record of a new run, as far as it is known before anything is opened."""
+    tree = config.to_tree(algorithm)
+    config.from_tree(tree)  # what cannot be read back should fail now, not at a resume
+    said: dict[str, Any] = {"algorithm": tree, "seed": seed, "options": options.record()}
+    said |= {"budget": Budget.of(algorithm, options).record(), "machine": config.machine()}
+    if warm_start is not None:
+        said["warm_start"] = str(warm_start)
+    if prompt := config.of_a_prompt(tree):
+        said["resumable"] = False
+        warnings.warn(
+            f"{', '.join(prompt)} was defined at a prompt or in a notebook: this run can go on in "
+            "this process alone; put it into a file for one that can be resumed",
+            stacklevel=5,
         )
+    return said
 
 
-def _record_budget(run: Run, old: Budget, budget: Budget, generation: int) -> None:
-    """Put another budget into the record, and the old one into its history."""
+def _begin(path: pathlib.Path, said: dict[str, Any], algorithm: Any, source: Run | None) -> None:
+    """Write the first checkpoint and the record. The checkpoint comes first: what has a record can
+    be resumed. The state is read back from it: two may be more than the memory holds."""
+    state = _initial(algorithm, jax.random.key(said["seed"]))
+    if source is not None:
+        state = _warm(algorithm, state, source)
+    said["task"] = config.to_tree(record.task_of(algorithm.env))
+    files.remove(path / "checkpoints")  # left by a process that died here
+    arrays, seals = eqx.filter(state, eqx.is_array), {"record": seal(said)}
+    checkpoint.save(path / "checkpoints", 0, arrays, {"frames": 0}, seals=seals)
+    record.write(path, said)
+
+
+@jit
+def _initial(algorithm: Any, root: PRNGKeyArray) -> PyTree:
+    return algorithm.init(key=jax.random.fold_in(root, 0))
+
+
+def _warm(algorithm: Any, state: PyTree, source: Run) -> PyTree:
+    """The first state, started from the champion of another run."""
+    if not hasattr(algorithm, "warm"):
+        raise RunError(
+            f"{type(algorithm).__name__} cannot start from another run's champion: only an "
+            "algorithm with a method `warm(state, policy)` can"
+        )
+    try:
+        policy = source.restored(state.champion)
+    except checkpoint.CheckpointError as error:
+        if "does not fit" not in str(error):
+            raise  # it is missing or damaged
+        raise RunError(_unlike(algorithm, source, error)) from error
+    return algorithm.warm(state, policy)
+
+
+def _unlike(algorithm: Any, source: Run, error: Exception) -> str:
+    """Why the champion of another run is none of this algorithm's policies."""
+    theirs, flag = source.config["algorithm"], "normalize_observations"
+    flags = [bool(theirs.get(flag)), getattr(algorithm, flag, False)]
+    if flags[0] != flags[1]:
+        return (
+            f"the champion of {source.path} was trained with {flag}={flags[0]}, and this run has "
+            f"{flag}={flags[1]}: give both the same"
+        )
+    network, task = (source.part(name) or config.brief(theirs[name]) for name in ("network", "env"))
+    return (
+        f"the champion of {source.path} is {network} on {task}, and this run is "
+        f"{algorithm.network} on {algorithm.env}: give the same --preset or --network, and a task "
+        f"of the same sizes ({str(error).splitlines()[0]})"
+    )
+
+
+# How a run goes on.
+
+
+def _load(run: Run, algorithm: Any, without_replay: bool = False) -> checkpoint.Checkpoint:
+    """The newest intact checkpoint of this very run, its state whole."""
+    lost: list[str] = []  # what is wrong with metrics.csv, by checkpoints that are whole
+
+    def check(generation: int, seals: Mapping[str, Any]) -> str | None:
+        why = record.stranger(run.config, seals.get("record"))
+        if why is None and "metrics" in seals:
+            why = run.differs(seals["metrics"])
+            lost.extend([why] if why else [])
+        # Some generations are soon trained again; a run whose checkpoints are whole never begins
+        # anew because another file was lost.
+        return lost[0] if why is None and generation == 0 and lost else why
+
+    like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0))
+    like, static = eqx.partition(like, lambda x: isinstance(x, jax.ShapeDtypeStruct))
+    number = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((), jnp.int32)
+    saved = checkpoint.load(
+        run.path / "checkpoints",
+        like,
+        extra=Best(like.champion, *number),  # pyright: ignore[reportArgumentType]
+        without_replay=without_replay,
+        check=check,
+    )
+    return eqx.tree_at(lambda saved: saved.state, saved, eqx.combine(saved.state, static))
+
+
+def _reopened(
+    run: Run, options: RunOptions, settings: dict[str, Any], without_replay: bool
+) -> tuple[Any, checkpoint.Checkpoint]:
+    """The algorithm with its new settings, and the checkpoint to go on from. What is changed is put
+    into the record, which is not written yet."""
+    algorithm, old = run.algorithm, Budget.read(run.config["budget"])
+    budget = old.going_on(algorithm, options)
+    # A smaller budget is refused, but only once it is known how far the run is. A setting may make
+    # generations longer: the buffer must hold what either plays.
+    either = (algorithm, config.replaced(algorithm, settings))
+    fit = max(
+        (fitted(one, limit) for one in either for limit in (old, budget)),
+        key=lambda one: getattr(one, "replay_capacity", 0),
+    )
+    fit = fitted_as(algorithm, fit)
+    with run.found():
+        record.check_task(run.config, algorithm.env)
+        saved = _load(run, fit, without_replay)
+    try:
+        budget.refuse_smaller(old, saved.generation, int(saved.counters["frames"]))
+    except ValueError as error:
+        raise RunError(f"{run.path}: {error}") from None
+    for change in run.config.get("changes", []):  # of an older checkpoint it begins earlier
+        change["generation"] = min(change["generation"], saved.generation)
+    if settings:
+        fit = _changed(run, fit, settings, saved.generation)
+        if any(name.startswith("env.") for name in settings):  # scores of another task
+            saved = dataclasses.replace(saved, extra=None)
     if budget != old:
-        change = {"generation": generation, "budget": old.record()}
-        run.config["changes"] = [*run.config.get("changes", []), change]
+        _note(run, saved.generation, budget=old.record())
         run.config["budget"] = budget.record()
+    return fit, saved
 
 
-def _changed(run: Run, fit: Any, changes: Mapping[str, Any], generation: int) -> Any:
+def _changed(run: Run, fit: Any, settings: dict[str, Any], generation: int) -> Any:
     """The algorithm with other settings, of the same state, and put into the record."""
-    recorded, before = run.config["algorithm"], short(run.config["algorithm"])
-    if not changes:
-        return fit
-    new = config.replaced(fit, dict(changes))
-    if "replay_capacity" in changes or _shapes(new) != _shapes(fit):
-        told = ", ".join(f"{name}={value!r}" for name, value in changes.items())
+    new = config.replaced(fit, settings)
+    if "replay_capacity" in settings or _shapes(new) != _shapes(fit):
+        told = ", ".join(f"{name}={value!r}" for name, value in settings.items())
         raise RunError(
             f"{told} changes the sizes of what {run.path} has learned: only numbers that change "
             "none can be set on the way; start a new run, with --from for its champion"
         )
-    tree = config.to_tree(config.replaced(run.algorithm, dict(changes)))
-    tree = json.loads(json.dumps(tree))
-    if tree != recorded:
-        change = {"generation": generation, "set": dict(changes), "before": before}
-        run.config["changes"] = [*run.config.get("changes", []), change]
+    before, tree = run.config["algorithm"], config.to_tree(config.replaced(run.algorithm, settings))
+    if tree != before:
+        _note(run, generation, set=settings, before=short(before))
         run.config["algorithm"] = tree
     return new
+
+
+def _note(run: Run, generation: int, **change: Any) -> None:
+    """Put into the record what is changed at a generation."""
+    changes = [*run.config.get("changes", []), {"generation": generation, **change}]
+    run.config["changes"] = changes
 
 
 def _shapes(algorithm: Any) -> Any:
@@ -311,201 +318,227 @@ def _shapes(algorithm: Any) -> Any:
     return structure, [(x.shape, x.dtype) if hasattr(x, "shape") else x for x in leaves]
 
 
-@contextlib.contextmanager
-def _found(run: Run) -> Iterator[None]:
-    """Say where a run began if what it names cannot be found from here."""
-    try:
-        yield
-    except (config.NotFound, EnvironmentFailure) as error:
-        home = record.home(run.config)
-        if not home:
-            raise
-        raise RunError(f"{str(error).rstrip('.')}{home}") from error
-
-
-def _champion(run: Run, like: PyTree) -> PyTree:
-    """The champion of a run, if that is what its file says."""
-    path = run.path / "champion.safetensors"
-    metadata = checkpoint.read_metadata(path)
-    if why := record.stranger(run.config, _json(metadata.get("record"))):
-        lines = config.differences(_json(metadata.get("algorithm")), run.config["algorithm"])
-        told = f" ({'; '.join(lines[:3])})" if lines else ""
-        raise RunError(
-            f"{path} is not this run's champion: {why}{told}; `credo resume {run.path}` writes it "
-            "again, or restore it from a copy"
-        )
-    return checkpoint.import_policy(path, like)
-
-
-def _json(text: str | None) -> Any:
-    try:
-        return json.loads(text or "null")
-    except ValueError:
-        return None
-
-
-def _verify_metrics(run: Run) -> None:
-    """Raise `RunError` if metrics.csv is not what the newest intact checkpoint says it was."""
-    for folder in sorted((run.path / "checkpoints").glob("[0-9]*"), reverse=True):
-        try:
-            seals = json.loads(files.read_bytes(folder / checkpoint.COMMIT))["seals"]
-            sealed = seals["metrics"]
-        except (OSError, ValueError, KeyError, TypeError):
-            continue  # damaged, or written by an older version
-        why = _unlike(run.path, sealed)
-        if why is None:
-            return
-        if checkpoint.damage(folder) is None and not record.stranger(run.config, seals["record"]):
-            raise RunError(
-                f"{why}; `credo resume` goes on from the newest checkpoint it agrees with"
+def _warn_of_other_machine(recorded: dict[str, Any]) -> None:
+    here = config.machine()
+    # What an older version did not record, a run of that time did not use.
+    known = recorded.get("versions", {})
+    here["versions"] = {name: here["versions"].get(name) for name in known}
+    for what in ("cores", "processor", "device", "versions"):
+        lines = config.differences(recorded.get(what, {}), here[what], what)
+        if lines:
+            warnings.warn(
+                f"this run began under other conditions ({'; '.join(lines)}): it goes on, but not "
+                "bit for bit",
+                stacklevel=3,
             )
 
 
-def _unlike(path: pathlib.Path, sealed: Any) -> str | None:
-    """How metrics.csv differs from what a checkpoint sealed, in words."""
-    try:
-        log.verify(path, sealed)
-    except (ValueError, KeyError, TypeError) as error:
-        return str(error)
-    return None
-
-
-def _load(run: Run, algorithm: Any, without_replay: bool = False) -> checkpoint.Checkpoint:
-    """The newest intact checkpoint of this very run, its state whole."""
-
-    def check(generation: int, seals: Mapping[str, Any]) -> str | None:
-        why = record.stranger(run.config, seals.get("record"))
-        if why is None and "metrics" in seals:
-            why = _unlike(run.path, seals["metrics"])
-            lost.extend([why] if why else [])
-        # Some generations are soon trained again; a run whose checkpoints are whole never begins
-        # anew because another file was lost.
-        return lost[0] if why is None and generation == 0 and lost else why
-
-    lost: list[str] = []  # what is wrong with metrics.csv, by checkpoints that are whole
-    like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0))
-    like, static = eqx.partition(like, lambda x: isinstance(x, jax.ShapeDtypeStruct))
-    saved = checkpoint.load(
-        run.path / "checkpoints", like, without_replay=without_replay, check=check
-    )
-    return eqx.tree_at(lambda saved: saved.state, saved, eqx.combine(saved.state, static))
+# The loop.
 
 
 def _train(
     run: Run,
     algorithm: Any,
     saved: checkpoint.Checkpoint,
-    wall_clock: float | None,
-    *,
-    checkpoint_every: float,
-    keep: int,
-    tensorboard: bool,
-    progress: bool,
-    callback: Callback | None,
+    options: RunOptions,
+    heard: list[callbacks.Callback],
 ) -> Run:
     """From `saved` to the end of the budget. The caller holds the lock."""
-    root = jax.random.key(run.config["seed"])
-    state, generation, frames = saved.state, saved.generation, int(saved.counters["frames"])
-    del saved  # the state is donated: nobody may hold the old one
-    budget = Budget.read(run.config["budget"])
-    log.Log(run.path, generation, tensorboard=False)  # what came after need not be readable
-    rows = log.read(run.path / "metrics.csv")
-    reached = budget.reached(generation, frames, _score_at(rows, generation))
-    journal = log.Log(run.path, generation, tensorboard=tensorboard and not reached)
-    before = journal.elapsed
-    began = last_save = time.monotonic()
-    safe, chunk, ended = generation, 1, False
-
-    board = Progress(run.path, generation, frames, budget, progress)
-    with Signals(quiet=not progress) as signals, board as bar:
-        if reached:
-            bar.say(f"is finished: {reached}; to go on give a larger --generations or --frames")
-        else:
-            _require_sound(run, state, generation, safe)
-            bar.say_memory(_buffers(state))
-            bar.start()
-        while not (reached or ended or signals.received):
-            tick = time.monotonic()
-            try:
-                state, batch = play(algorithm, state, root, generation, frames, chunk, budget)
-            except EnvironmentFailure as failure:
-                # The state was donated: what is on disk is all there is.
-                journal.close()
-                raise RunError(
-                    f"{str(failure).rstrip('.')}. The checkpoint of generation {safe} stands; "
-                    f"resume with `credo resume {run.path}`"
-                ) from failure
-            generation, frames = batch[-1]["generation"], batch[-1]["frames"]
-            _require_sound(run, state, generation, safe)
-            now = time.monotonic()
-            seconds = now - tick
-            journal.append(batch, seconds, before + now - began)
-            bar.update(generation, batch[-1], seconds)
-            if callback is not None:
-                answers = [callback(row["generation"], row) for row in batch]
-                ended = any(answers)
-            ended = ended or (wall_clock is not None and now - began >= wall_clock)
-            reached = budget.reached(generation, frames, batch[-1]["champion_score"])
-            if now - last_save >= checkpoint_every:
-                journal.sync()
-                _save(run, generation, state, frames, keep)
-                safe, last_save = generation, now
-            # The first dispatch compiles; from the second on, its length follows the clock.
-            # How many generations one dispatch holds is data and changes no result.
-            chunk = 2 if chunk == 1 else int(np.clip(len(batch) * DISPATCH / seconds, 1, CHUNK))
-        journal.close()
-        journal.sync()
-        _save(run, generation, state, frames, keep)
-    if signals.received and not reached:
+    training = _Training(run, algorithm, saved, options, heard)
+    del saved  # its state is donated: nobody may hold the old one
+    with Signals(quiet=not options.progress) as signals, training.bar:
+        reason = training.go_on(signals)
+    if reason == "signal":
+        where = training.budget.where(training.generation, training.frames)
         raise Interrupted(
-            f"stopped at {budget.where(generation, frames)} and saved; go on with "
-            f"`credo resume {run.path}`",
-            128 + signals.received,
+            f"stopped at {where} and saved; go on with {run.advice}", 128 + signals.received
         )
     return run
+
+
+class _Training:
+    """A run that goes on: where it is, what it writes and who hears of it."""
+
+    def __init__(
+        self,
+        run: Run,
+        algorithm: Any,
+        saved: checkpoint.Checkpoint,
+        options: RunOptions,
+        heard: list[callbacks.Callback],
+    ):
+        self.run, self.algorithm, self.options = run, algorithm, options
+        self.root, self.budget = (
+            jax.random.key(run.config["seed"]),
+            Budget.read(run.config["budget"]),
+        )
+        self.generation, self.frames = saved.generation, int(saved.counters["frames"])
+        arrays = eqx.filter(saved.state.champion, eqx.is_array)
+        self.state, self.best = saved.state, saved.extra or Best.none(arrays)
+        self.safe, self.chunk = saved.generation, 1
+        self.journal = log.Log(run.path, self.generation)
+        score = float(log.last(run.path / log.METRICS).get("champion_score", -np.inf))
+        self.reached = self.budget.reached(self.generation, self.frames, score)
+        every = getattr(algorithm, "test_every", 1) == 1
+        self.listeners = callbacks.Listeners(run, heard, score, every)
+        self.ended = ""  # why, if neither the budget nor a signal is
+        self.bar = Progress(run.path, self.generation, self.frames, self.budget, options.progress)
+        self.began = self.last_save = time.monotonic()
+        self.before = self.journal.elapsed
+
+    def go_on(self, signals: Signals) -> str:
+        """Train, save, and say why it ended (see `Callback.on_end`)."""
+        if self.reached:
+            told = f"is finished: {self.reached}; to go on give a larger --generations or --frames"
+            self.bar.say(told)
+            self.save()
+            return "budget"
+        self.require_sound()
+        self.bar.say_memory(_buffers(self.state))
+        self.bar.start()
+        try:
+            while not (self.reached or self.ended or signals.received):
+                self.dispatch()
+            self.save()
+        except Exception:
+            self.listeners.tell("on_end", "error")
+            raise
+        reason = self.reason()
+        self.listeners.end(reason)
+        return reason
+
+    def reason(self) -> str:
+        """Why training ended."""
+        if self.listeners.error is not None:
+            return "error"
+        if self.reached:
+            return "budget" if self.budget.reached(self.generation, self.frames) else "score"
+        return self.ended or "signal"
+
+    def dispatch(self) -> None:
+        """Some generations: play, write, tell, and save now and then."""
+        tick = time.monotonic()
+        rows = self.play()
+        self.require_sound()
+        now = time.monotonic()
+        seconds = now - tick
+        self.journal.append(rows, seconds, self.before + now - self.began)
+        self.bar.update(self.generation, rows[-1], seconds)
+        limit = self.options.wall_clock
+        if self.listeners.hear(rows):
+            self.ended = "callback"
+        elif limit is not None and now - self.began >= limit:
+            self.ended = "wall clock"
+        self.reached = self.budget.reached(self.generation, self.frames, rows[-1]["champion_score"])
+        if now - self.last_save >= self.options.checkpoint_every:
+            self.save()
+            self.last_save = now
+        # The first dispatch compiles; from the second on, its length follows the clock.
+        # How many generations one dispatch holds is data and changes no result.
+        again = int(np.clip(len(rows) * DISPATCH / seconds, 1, CHUNK))
+        self.chunk = 2 if self.chunk == 1 else again
+
+    def play(self) -> list[dict[str, Any]]:
+        """The next generations; a row of metrics for each."""
+        at = (self.root, self.generation, self.frames, self.chunk, self.budget)
+        try:
+            self.state, self.best, rows = play(self.algorithm, self.state, self.best, *at)
+        except EnvironmentFailure as failure:
+            # The state was donated: what is on disk is all there is.
+            raise RunError(
+                f"{str(failure).rstrip('.')}. The checkpoint of generation {self.safe} stands; "
+                f"resume with {self.run.advice}"
+            ) from failure
+        self.generation, self.frames = rows[-1]["generation"], rows[-1]["frames"]
+        return rows
+
+    def require_sound(self) -> None:
+        """End a training whose weights are no numbers: nothing can be learned from there."""
+        if (what := weights.broken(self.state)) is None:
+            return
+        stands = f"The checkpoint of generation {self.safe} stands"
+        if self.generation == self.safe:
+            stands = "It began so"
+        raise RunError(
+            f"the weights of {what} are not finite after generation {self.generation} of "
+            f"{self.run.path}: nothing more can be learned. {stands}; look at the size of rewards "
+            "and observations, and at the learning rates (credo resume RUN --set NAME=VALUE)"
+        )
+
+    def save(self) -> None:
+        """A checkpoint, then the policies: what a policy's file says is never ahead of it."""
+        self.journal.sync()
+        path, generation, sealed = self.run.path, self.generation, seal(self.run.config)
+        seals: dict[str, Any] = {"record": sealed}
+        if generation > 0:
+            seals["metrics"] = log.seal(path, generation)
+        checkpoint.save(
+            path / "checkpoints",
+            generation,
+            eqx.filter(self.state, eqx.is_array),
+            {"frames": self.frames},
+            extra=self.best,
+            keep=self.options.keep,
+            seals=seals,
+        )
+        metadata = {"algorithm": json.dumps(self.run.config["algorithm"])}
+        metadata |= {"record": json.dumps(sealed, sort_keys=True)}
+        told = metadata | {"generation": str(generation)}
+        checkpoint.export_policy(path / CHAMPION, self.state.champion, told)
+        if self.best.score > NOTHING:
+            told = metadata | {"generation": str(int(self.best.generation))}
+            told |= {"score": repr(float(self.best.score))}
+            checkpoint.export_policy(path / BEST, self.best.policy, told)
+        self.safe = generation
 
 
 def play(
     algorithm: Any,
     state: PyTree,
+    best: Best,
     root: PRNGKeyArray,
     generation: int,
     frames: int,
     n: int,
     budget: Budget,
-) -> tuple[PyTree, list[dict[str, Any]]]:
+) -> tuple[PyTree, Best, list[dict[str, Any]]]:
     """The next generations, at most `n` and `CHUNK`, none beyond the budget; one if the task lies
-    outside JAX. `state` is used up.
+    outside JAX. `state` and `best` are used up.
 
-    **Returns:** the state and a row of metrics, in Python numbers, for each generation.
+    **Returns:** the state, the best policy so far, and a row of metrics, in Python numbers, for
+    each generation.
     """
     if isinstance(algorithm.env, AbstractHostEnvironment):
         state, metrics = algorithm.generation(state, key=jax.random.fold_in(root, generation + 1))
         columns, count = jax.tree.map(lambda x: np.asarray(x)[None], metrics), 1
+        score = columns["champion_score"][0]
+        if score > best.score:
+            arrays = Best.none(eqx.filter(state.champion, eqx.is_array)).policy
+            best = Best(arrays, score, np.int32(generation + 1))  # pyright: ignore[reportArgumentType]
     else:
         n = min(n, CHUNK, (budget.generations or MOST) - generation)
         left = MOST if budget.frames is None else min(budget.frames - frames, MOST)
         numbers = (np.int32(generation), np.int32(n), np.int32(left), budget.stop_score)
-        state, count, metrics = advance((algorithm, root, *numbers), state)
+        state, best, count, metrics = advance((algorithm, root, *numbers), state, best)
         columns = jax.tree.map(np.asarray, metrics)
-    batch = []
+    rows = []
     for i in range(int(count)):
         row = {name: column[i].item() for name, column in columns.items()}
         row = {name: np.nan if value == NOTHING else value for name, value in row.items()}
         frames += int(row.pop("frames"))
-        batch.append({"generation": generation + i + 1, "frames": frames, **row})
-    return state, batch
+        rows.append({"generation": generation + i + 1, "frames": frames, **row})
+    return state, best, rows
 
 
 @jit(donate="all-except-first")
-def advance(fixed: tuple[Any, ...], state: PyTree):
+def advance(fixed: tuple[Any, ...], state: PyTree, best: Best):
     """`n` generations, at most `CHUNK`, in one program; fewer if a score reaches `stop_at`, or
     their frames `left`. The memory of `state` is used for the result.
 
     **Arguments:** `fixed`: the algorithm, the root key, how many generations are done, `n`,
     `left` and `stop_at`.
 
-    **Returns:** the state, how many generations ran, and metrics `[CHUNK]` each.
+    **Returns:** the state, the best policy, how many generations ran, and metrics `[CHUNK]` each.
     """
     algorithm, root, generation, n, left, stop_at = fixed
     dynamic, static = eqx.partition(state, eqx.is_array)
@@ -520,105 +553,24 @@ def advance(fixed: tuple[Any, ...], state: PyTree):
     empty = jax.tree.map(lambda x: jnp.zeros((CHUNK, *x.shape), x.dtype), shapes)
 
     def body(loop):
-        i, left, dynamic, _, kept = loop
+        i, left, dynamic, best, _, kept = loop
         dynamic, metrics = one(dynamic, i)
         kept = jax.tree.map(lambda xs, x: xs.at[i].set(x), kept, metrics)
-        left = left - metrics["frames"].astype(jnp.int32)
-        return i + 1, left, dynamic, metrics["champion_score"], kept
+        left, score = left - metrics["frames"].astype(jnp.int32), metrics["champion_score"]
+        new = Best(dynamic.champion, score, generation + i + 1)
+        better = score > best.score  # False of NaN
+        best = jax.tree.map(lambda a, b: jnp.where(better, b, a), best, new)
+        return i + 1, left, dynamic, best, score, kept
 
     def ongoing(loop):
-        i, left, _, score, _ = loop
+        i, left, _, _, score, _ = loop
         return (i < n) & (left > 0) & ~(score >= stop_at)
 
-    start = (jnp.int32(0), left, dynamic, jnp.float32(-jnp.inf), empty)
-    count, _, dynamic, _, kept = jax.lax.while_loop(ongoing, body, start)
-    return eqx.combine(dynamic, static), count, kept
-
-
-@jit
-def _initial(algorithm: Any, root: PRNGKeyArray) -> PyTree:
-    return algorithm.init(key=jax.random.fold_in(root, 0))
-
-
-def _save(run: Run, generation: int, state: PyTree, frames: int, keep: int):
-    arrays, sealed = eqx.filter(state, eqx.is_array), seal(run.config)
-    seals: dict[str, Any] = {"record": sealed}
-    if generation > 0:
-        seals["metrics"] = log.seal(run.path, generation)
-    counters = {"frames": frames}
-    checkpoint.save(run.path / "checkpoints", generation, arrays, counters, keep=keep, seals=seals)
-    metadata = {"algorithm": json.dumps(run.config["algorithm"]), "generation": str(generation)}
-    metadata["record"] = json.dumps(sealed, sort_keys=True)
-    checkpoint.export_policy(run.path / "champion.safetensors", state.champion, metadata)
-
-
-def _warm(algorithm: Any, state: PyTree, source: Run) -> PyTree:
-    """The first state, started from the champion of another run."""
-    if not hasattr(algorithm, "warm"):
-        raise RunError(
-            f"{type(algorithm).__name__} cannot start from another run's champion: only an "
-            "algorithm with a method `warm(state, policy)` can"
-        )
-    try:
-        policy = _champion(source, state.champion)
-    except checkpoint.CheckpointError as error:
-        if "does not fit" not in str(error):
-            raise  # it is missing or damaged
-        theirs = [
-            source.part(name) or config.brief(source.config["algorithm"][name])
-            for name in ("network", "env")
-        ]
-        flag = "normalize_observations"
-        flags = [bool(source.config["algorithm"].get(flag)), getattr(algorithm, flag, False)]
-        if flags[0] != flags[1]:
-            raise RunError(
-                f"the champion of {source.path} was trained with {flag}={flags[0]}, and this run "
-                f"has {flag}={flags[1]}: give both the same"
-            ) from error
-        raise RunError(
-            f"the champion of {source.path} is {theirs[0]} on {theirs[1]}, and this run is "
-            f"{algorithm.network} on {algorithm.env}: give the same --preset or --network, and a "
-            f"task of the same sizes ({str(error).splitlines()[0]})"
-        ) from error
-    return algorithm.warm(state, policy)
-
-
-def _require_sound(run: Run, state: PyTree, generation: int, safe: int) -> None:
-    """End a training whose weights are no numbers any more: nothing can be learned from there."""
-    if (what := weights.broken(state)) is None:
-        return
-    stands = f"The checkpoint of generation {safe} stands"
-    if generation == safe:
-        stands = "It began so"
-    raise RunError(
-        f"the weights of {what} are not finite after generation {generation} of {run.path}: "
-        f"nothing more can be learned. {stands}; look at the size of rewards and observations, and "
-        "at the learning rates (credo resume RUN --set NAME=VALUE)"
-    )
+    start = (jnp.int32(0), left, dynamic, best, jnp.float32(-jnp.inf), empty)
+    count, _, dynamic, best, _, kept = jax.lax.while_loop(ongoing, body, start)
+    return eqx.combine(dynamic, static), best, count, kept
 
 
 def _buffers(state: PyTree) -> list[Replay]:
     leaves = jax.tree.leaves(state, is_leaf=lambda x: isinstance(x, Replay))
     return [leaf for leaf in leaves if isinstance(leaf, Replay)]
-
-
-def _score_at(rows: dict[str, np.ndarray], generation: int) -> float:
-    if generation == 0 or "champion_score" not in rows:
-        return -np.inf
-    match = np.flatnonzero(rows["generation"] == generation)
-    return float(rows["champion_score"][match[-1]]) if match.size else -np.inf
-
-
-def _warn_of_other_machine(recorded: dict[str, Any]):
-    here = config.machine()
-    # What an older version did not record, a run of that time did not use.
-    known = recorded.get("versions", {})
-    here["versions"] = {name: here["versions"].get(name) for name in known}
-    for what in ("cores", "processor", "device", "versions"):
-        lines = config.differences(recorded.get(what, {}), here[what], what)
-        if lines:
-            warnings.warn(
-                f"this run began under other conditions ({'; '.join(lines)}): it goes on, but not "
-                "bit for bit",
-                stacklevel=3,
-            )

@@ -15,8 +15,8 @@ LARGEST = 2**63 - 1
 class RunOptions:
     """Everything about a run that changes no bit of a generation.
 
-    The same record serves Python, the command line, the processes of several runs and `config.json`.
-    Raises `ValueError` for a value outside its range.
+    The same record serves Python, the command line, the processes of several runs and
+    `config.json`. Raises `ValueError` for a value outside its range.
     """
 
     generations: int | None = None
@@ -38,13 +38,13 @@ class RunOptions:
     """Seconds between two checkpoints, at least 0; 0: after every dispatch."""
 
     keep: int = 3
-    """Checkpoints that stay on disk, at least 1. With 2 or more, two copies of a replay buffer do."""
+    """Checkpoints that stay on disk, at least 1; 2 or more hold two copies of a replay buffer."""
 
     tensorboard: bool = True
     """Whether to write TensorBoard events, into `tensorboard/` of the run's folder."""
 
     loggers: tuple[Literal["wandb", "trackio"], ...] = ()
-    """Experiment trackers that get every metric: wandb, trackio. Each is a package of its own, as in
+    """Experiment trackers that get every metric: wandb, trackio. Each is a package of its own:
     `pip install "credo[wandb]"`."""
 
     progress: bool = True
@@ -66,11 +66,13 @@ class RunOptions:
         if self.stop_at is not None and math.isnan(self.stop_at):
             raise ValueError("stop_at is nan: give a champion score, or None to stop at none")
         require.at_least("keep", self.keep, 1)
+        object.__setattr__(self, "callbacks", tuple(self.callbacks))
+        object.__setattr__(self, "loggers", tuple(self.loggers))
         for name in self.loggers:
             require.choice("loggers", name, ("wandb", "trackio"))
 
     def changed(self, changes: dict[str, Any]) -> "RunOptions":
-        """These options with others in the place of some. Raises `TypeError` for an unknown name."""
+        """These options with other values. Raises `TypeError` for an unknown name."""
         known = [field.name for field in dataclasses.fields(self)]
         for name in changes:
             if name not in known:
@@ -78,7 +80,14 @@ class RunOptions:
         return dataclasses.replace(self, **changes)
 
     def record(self) -> dict[str, Any]:
-        """As JSON: all but what only this process knows."""
-        told = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        del told["callbacks"]
-        return told | {"loggers": list(self.loggers)}
+        """As JSON, for `config.json` and other processes: all but this process's screen and
+        callbacks."""
+        told = vars(self) | {"loggers": list(self.loggers)}
+        return {
+            name: value for name, value in told.items() if name not in ("progress", "callbacks")
+        }
+
+    @classmethod
+    def read(cls, record: dict[str, Any]) -> "RunOptions":
+        """The options of a process that has no screen, from what `record` said."""
+        return cls(**record, progress=False)

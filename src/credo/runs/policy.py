@@ -1,4 +1,4 @@
-"""A run's best policy as a plain callable, in the units of its own task."""
+"""A run's policy as a plain callable, in the units of its own task."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -67,20 +67,23 @@ class Policy:
         return np.asarray(action)
 
 
-def of(run: Any, raw: bool = False) -> Policy:
-    """The best policy of a `Run` in its task's units; `raw`: with actions in [-1, 1]."""
+def of(run: Any, raw: bool = False, *, best: bool = False) -> Policy:
+    """The champion of a `Run` in its task's units; `raw`: with actions in [-1, 1]; `best`: the
+    best policy in its place."""
     task = run.config.get("task") if raw else task_of(run)
-    return Policy(champion(run), task, raw=raw)
+    return Policy(champion(run, best=best), task, raw=raw)
 
 
 @float32()
-def champion(run: Any) -> PyTree:
-    """The policy in a run's folder. Where its record tells the task's sizes and its networks are
-    Credo's own, no environment is opened, and nothing of somebody's own is imported."""
+def champion(run: Any, *, best: bool = False) -> PyTree:
+    """The champion in a run's folder, or the best policy. Where its record tells the task's sizes
+    and its networks are Credo's own, no environment is opened, and nothing of somebody's own is
+    imported."""
     tree, network = run.config["algorithm"], run.part("network")
     if network is None or "task" not in run.config or not tree["class"].startswith("credo."):
-        return run.champion
-    return run.restored(_like(network, tree.get("normalize_observations"), _units(run)))
+        return run.best if best else run.champion
+    like = _like(network, tree.get("normalize_observations"), _units(run))
+    return run.restored(like, best=best)
 
 
 def _like(network: Any, normalized: bool | None, units: Units) -> PyTree:

@@ -3,6 +3,7 @@
     algorithm   the object tree, as `config.to_tree` records it
     seed        everything random follows from it
     budget      limits of generations, frames and score
+    options     how it was run at the start (`RunOptions`); nothing that is learned follows from it
     machine     versions, processor, cores, device and system at the start
     task        sizes and actions of the task at the start, and the folder it was found from
     warm_start  the run whose champion this one started from
@@ -240,6 +241,7 @@ FIELDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     # Older versions took seeds that JAX cuts to 32 bits.
     "seed": (lambda value: _whole(value, -(2**63), 2**63 - 1), "a whole number"),
     "budget": (_is_budget, "generations and frames, whole numbers of at least 1, and stop_at"),
+    "options": (lambda value: isinstance(value, dict), "an object"),
     "machine": (_is_machine, "versions, processor, cores, device and system"),
     "task": (_is_task, "the sizes of the task and the folder it was found from"),
     "warm_start": (_is_text, "the path of a run"),

@@ -1,5 +1,5 @@
 """A process that trains one run after another: a job per line of JSON in, an answer per line out.
-Started by `executor`; it ends when its input does."""
+Started by `local`; it ends when its input does."""
 
 import contextlib
 import ctypes
@@ -12,15 +12,6 @@ import threading
 import time
 from typing import Any
 
-OPTIONS = (
-    "generations",
-    "frames",
-    "stop_at",
-    "wall_clock",
-    "checkpoint_every",
-    "keep",
-    "tensorboard",
-)
 GRACE = 60.0  # seconds to save in, once the parent is gone
 PR_SET_PDEATHSIG = 1
 
@@ -30,7 +21,7 @@ def command(core: int) -> list[str]:
     name, and a script may have added to the path."""
     path = [os.path.abspath(entry) for entry in sys.path if entry or os.path.exists(".")]
     start = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    start += "import credo.runs.worker as worker; worker.main(int(sys.argv[2]))"
+    start += "import credo.executors.worker as worker; worker.main(int(sys.argv[2]))"
     return [sys.executable, "-c", start, json.dumps(path), str(core)]
 
 
@@ -67,7 +58,7 @@ def main(core: int) -> None:
 
     import jax
 
-    from . import loop
+    from ..runs import loop
 
     def answer(told: dict[str, Any]) -> None:
         answers.write(json.dumps(told) + "\n")
@@ -90,13 +81,12 @@ def main(core: int) -> None:
 
 
 def _train(job: dict[str, Any]) -> None:
-    from . import config, loop
+    from ..runs import config, loop, options, record
 
-    path, options = pathlib.Path(job["path"]), {name: job[name] for name in OPTIONS}
-    if (path / "config.json").exists():
+    path, told = pathlib.Path(job["path"]), options.RunOptions.read(job["options"])
+    if (path / record.NAME).exists():
         # Its settings are those of the job: the parent looked (`Job.finished`).
-        loop.resume(path, trust=job["trust"], progress=False, **options)
+        loop.resume(path, told, **job["again"])
     else:
-        algorithm = config.from_tree(job["algorithm"], trust=job["trust"])
-        start = {"seed": job["seed"], "warm_start": job["warm_start"]}
-        loop.train(algorithm, path=path, progress=False, **start, **options)
+        algorithm = config.from_tree(job["algorithm"], trust=job["again"]["trust"])
+        loop.train(algorithm, told, path=path, seed=job["seed"], warm_start=job["warm_start"])

@@ -13,8 +13,10 @@ import pytest
 
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.sequence_classification import SequenceClassification
+from credo.executors import local, worker
 from credo.networks.mmu import MMU
-from credo.runs import config, executor, loop, worker
+from credo.runs import config, loop
+from credo.runs.options import RunOptions
 
 ALGORITHM = Neuroevolution(
     SequenceClassification(depth=2, min_gap=1, max_gap=2),
@@ -23,8 +25,14 @@ ALGORITHM = Neuroevolution(
     episodes=4,
     test_episodes=6,
 )
+FIVE = RunOptions(generations=5, tensorboard=False)
 IMPOSSIBLE = config.to_tree(ALGORITHM)
 IMPOSSIBLE["env"] = IMPOSSIBLE["env"] | {"depth": 0}
+
+
+def wanting(job, **changes):
+    """The same run with other options."""
+    return dataclasses.replace(job, options=job.options.changed(changes))
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +40,12 @@ def trained(tmp_path_factory):
     """Three jobs, one of them impossible, by two workers; and what was said."""
     folder = tmp_path_factory.mktemp("jobs")
     jobs = [
-        executor.Job(folder / "0", ALGORITHM, 5, seed=0),
-        executor.Job(folder / "bad", IMPOSSIBLE, 5, seed=0),
-        executor.Job(folder / "1", ALGORITHM, 5, seed=1),
+        local.Job(folder / "0", ALGORITHM, 0, FIVE),
+        local.Job(folder / "bad", IMPOSSIBLE, 0, FIVE),
+        local.Job(folder / "1", ALGORITHM, 1, FIVE),
     ]
     with pytest.raises(loop.RunError) as error:
-        executor.run(jobs, workers=2)
+        local.run(jobs, workers=2)
     return jobs, str(error.value)
 
 
@@ -64,22 +72,22 @@ def test_a_worker_trains_like_this_process(trained, tmp_path):
 def test_what_is_finished_is_not_run_again(trained, monkeypatch):
     (first, _, second), _ = trained
     started = []
-    monkeypatch.setattr(executor, "_start", lambda core: started.append(core))
-    executor.run([first, second], workers=2)
+    monkeypatch.setattr(local, "_start", lambda core: started.append(core))
+    local.run([first, second], workers=2)
     assert started == []
-    longer = dataclasses.replace(first, generations=6)
+    longer = wanting(first, generations=6)
     assert not longer.finished()
     # Results of more generations would be reported under fewer.
     with pytest.raises(loop.RunError, match="generations: 5 != 4"):
-        dataclasses.replace(first, generations=4).finished()
+        wanting(first, generations=4).finished()
 
 
 def test_what_reached_its_score_is_finished(trained):
     (first, *_), _ = trained
     score = float(loop.Run(first.path).metrics["champion_score"][-1])
-    longer = dataclasses.replace(first, generations=100)
-    assert dataclasses.replace(longer, stop_at=score - 0.01).finished()
-    assert not dataclasses.replace(longer, stop_at=score + 0.01).finished()
+    longer = wanting(first, generations=100)
+    assert wanting(longer, stop_at=score - 0.01).finished()
+    assert not wanting(longer, stop_at=score + 0.01).finished()
     assert np.isfinite(score)
 
 
@@ -97,7 +105,7 @@ def test_a_folder_with_another_run_is_refused(trained, changes, told):
     (first, *_), _ = trained
     before = (first.path / "config.json").read_bytes()
     with pytest.raises(loop.RunError, match=told):
-        executor.run([dataclasses.replace(first, **changes)])
+        local.run([dataclasses.replace(first, **changes)])
     assert (first.path / "config.json").read_bytes() == before
 
 
@@ -119,10 +127,10 @@ def test_a_process_that_dies_is_told_and_replaced(tmp_path, monkeypatch):
         started.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True))
         return started[-1]
 
-    monkeypatch.setattr(executor, "_start", start)
-    jobs = [executor.Job(tmp_path / str(seed), ALGORITHM, 5, seed) for seed in range(3)]
+    monkeypatch.setattr(local, "_start", start)
+    jobs = [local.Job(tmp_path / str(seed), ALGORITHM, seed, FIVE) for seed in range(3)]
     with pytest.raises(loop.RunError) as error:
-        executor.run(jobs, workers=1)
+        local.run(jobs, workers=1)
     assert str(error.value) == (
         f"1 of 3 runs failed:\n{jobs[0].path}: its process ended with exit code -9"
     )
@@ -133,10 +141,10 @@ def test_a_job_stopped_half_way_goes_on(trained, tmp_path):
     (first, *_), _ = trained
     path = tmp_path / "half"
     quiet = {"tensorboard": False, "progress": False}
-    loop.train(ALGORITHM, generations=5, path=path, callback=lambda g, m: True, **quiet)
+    loop.train(ALGORITHM, generations=5, path=path, callbacks=(lambda *_: True,), **quiet)
     job = dataclasses.replace(first, path=path)
     assert not job.finished()
-    executor.run([job])
+    local.run([job])
     assert job.finished()
     assert (path / "metrics.csv").read_bytes() == (first.path / "metrics.csv").read_bytes()
 
@@ -149,7 +157,7 @@ def test_a_signal_reaches_every_worker_and_each_saves(tmp_path):
         sys.executable,
         "-c",
         # Two workers, also where there is one core.
-        "import sys; from credo import cli; from credo.runs import executor as e; run = e.run\n"
+        "import sys; from credo import cli; from credo.executors import local as e; run = e.run\n"
         "e.run = lambda jobs: run(jobs, workers=2)\ncli.main(sys.argv[1:])",
         *arguments.split(),
     ]
@@ -211,11 +219,12 @@ time.sleep(100)
 """
 RUNS = """
 import sys
-from credo.runs import executor, worker
-from credo.runs.budget import Budget
+from credo.executors import local, worker
+from credo.runs.options import RunOptions
 worker.command = lambda core: [sys.executable, "-c", sys.argv[1], sys.argv[2]]
-executor.Job.finished = lambda self: False
-executor.run([executor.Job(sys.argv[2] + "-run", {"class": "a:B"}, 5, seed=0)], workers=1)
+local.Job.finished = lambda self: False
+options = RunOptions(generations=5)
+local.run([local.Job(sys.argv[2] + "-run", {"class": "a:B"}, 0, options)], workers=1)
 """
 
 
@@ -246,7 +255,7 @@ def test_a_second_signal_ends_workers_that_are_deaf_to_it(tmp_path):
 
 @linux
 def test_workers_end_with_a_parent_that_is_killed():
-    child = "import os; from credo.runs import worker; worker._ask_for_death(os.getppid())\n"
+    child = "import os; from credo.executors import worker; worker._ask_for_death(os.getppid())\n"
     child += "print(os.getpid(), flush=True); import time; time.sleep(100)"
     script = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
@@ -259,10 +268,10 @@ def test_workers_end_with_a_parent_that_is_killed():
 
 
 def test_what_a_stranger_recorded_is_not_trusted_by_a_worker(tmp_path):
-    job = executor.Job(tmp_path, ALGORITHM, 5, seed=0)
+    job = local.Job(tmp_path, ALGORITHM, 0, FIVE)
     assert json.loads(job.message())["trust"] is True
     tree = json.loads(json.dumps(config.to_tree(ALGORITHM))) | {"class": "nowhere:Algorithm"}
-    job = executor.Job(tmp_path, tree, 5, seed=0)
+    job = local.Job(tmp_path, tree, 0, FIVE)
     assert json.loads(job.message())["trust"] is False  # and nothing was imported for it
     assert config.changed(tree, tree) == []
     assert os.listdir(tmp_path) == []

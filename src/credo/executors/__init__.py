@@ -1,0 +1,1 @@
+"""Where many runs are trained: one call, `run(jobs, workers)`, for each kind of machine."""

@@ -1,0 +1,164 @@
+"""A run on disk: what it says of itself, its metrics, and its policies."""
+
+import contextlib
+import json
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from .. import compilation
+from ..environments.host import EnvironmentFailure
+from ..replay import shapes_alone
+from . import checkpoint, config, files, log, policy, record
+from .policy import Policy
+from .record import RunError
+from .trust import signed_here
+
+CHAMPION, BEST = "champion.safetensors", "best.safetensors"
+
+
+class Run:
+    """A run on disk, finished or not. Reading it changes nothing."""
+
+    def __init__(self, path: str | pathlib.Path, *, trust: bool = False):
+        """`trust`: whether classes and environments of somebody's own may be imported that a run
+        names which this user did not make. Raises `RunError`."""
+        self.path = pathlib.Path(path)
+        self.config = record.read(self.path)
+        self.trusted = trust or signed_here(self.config)
+
+    @property
+    def algorithm(self) -> Any:
+        """What was recorded, as an object. A team outside JAX is opened for it, no other task."""
+        tree = self.config["algorithm"]
+        with self.found():
+            return config.from_tree(tree, trust=self.trusted, source=str(self.path))
+
+    def part(self, name: str) -> Any:
+        """A field of the recorded algorithm as an object (its `env`, `network`, `learners`), made
+        of Credo's own classes; None if somebody's own code would have to be imported for it. It
+        opens no environment."""
+        try:
+            return config.from_tree(self.config["algorithm"].get(name), trust=False)
+        except ValueError:
+            return None
+
+    @property
+    def metrics(self) -> dict[str, np.ndarray]:
+        """Columns of `metrics.csv`, one entry per generation. Raises `RunError` if it is not what
+        the newest checkpoint says it was."""
+        self._verify_metrics()
+        return log.read(self.path / "metrics.csv")
+
+    @property
+    def champion(self) -> PyTree:
+        """The policy with the highest fitness of the last generation; of a learner alone, its
+        actor. Raises `RunError` if it is another run's, or if the task has other sizes today."""
+        return self._opened(CHAMPION)
+
+    @property
+    def best(self) -> PyTree:
+        """The champion with the highest test score of all generations; of equal ones the first.
+        Its score is that of one test, so it flatters: evaluate it on fresh episodes. Raises as
+        `champion` does, and `RunError` if there is none yet."""
+        return self._opened(BEST)
+
+    @property
+    def best_test(self) -> tuple[int, float]:
+        """The generation of the best policy, and its score in that generation's test."""
+        metadata = self._metadata(BEST)
+        return int(metadata["generation"]), float(metadata["score"])
+
+    def restored(self, like: PyTree, *, best: bool = False) -> PyTree:
+        """The champion, or the best policy, of which `like` has the structure. Raises as `champion`
+        does."""
+        name = BEST if best else CHAMPION
+        self._metadata(name)
+        return checkpoint.import_policy(self.path / name, like)
+
+    def policy(self, raw: bool = False, *, best: bool = False) -> Policy:
+        """The champion as a plain callable, in the task's own units; `raw`: in [-1, 1]; `best`: the
+        best policy in its place."""
+        return policy.of(self, raw, best=best)
+
+    @property
+    def advice(self) -> str:
+        """How to go on with this run, as a part of a sentence."""
+        if self.config.get("resumable", True):
+            return f"`credo resume {self.path}`"
+        return f"credo.resume({str(self.path)!r}) in this process, which alone knows its classes"
+
+    @contextlib.contextmanager
+    def found(self) -> Iterator[None]:
+        """Say where a run began if what it names cannot be found from here."""
+        try:
+            yield
+        except (config.NotFound, EnvironmentFailure) as error:
+            home = record.home(self.config)
+            if not home:
+                raise
+            raise RunError(f"{str(error).rstrip('.')}{home}") from error
+
+    def differs(self, sealed: Any) -> str | None:
+        """How metrics.csv differs from what a checkpoint sealed, in words."""
+        try:
+            log.verify(self.path, sealed)
+        except (ValueError, KeyError, TypeError) as error:
+            return str(error)
+        return None
+
+    @compilation.float32()
+    def _opened(self, name: str) -> PyTree:
+        algorithm = self.algorithm
+        with self.found(), shapes_alone():
+            record.check_task(self.config, algorithm.env)
+            like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0)).champion
+        return self.restored(like, best=name == BEST)
+
+    def _metadata(self, name: str) -> dict[str, str]:
+        """What a policy's file says of itself. Raises `RunError` if it is another run's."""
+        path = self.path / name
+        if name == BEST and not path.exists():
+            raise RunError(
+                f"{path} is not there: no policy was tested since this run began to keep it"
+            )
+        metadata = checkpoint.read_metadata(path)
+        if why := record.stranger(self.config, _json(metadata.get("record"))):
+            before = _json(metadata.get("algorithm"))
+            lines = config.differences(before, self.config["algorithm"])
+            told = f" ({'; '.join(lines[:3])})" if lines else ""
+            what = "champion" if name == CHAMPION else "best policy"
+            raise RunError(
+                f"{path} is not this run's {what}: {why}{told}; {self.advice} writes it again, or "
+                "restore it from a copy"
+            )
+        return metadata
+
+    def _verify_metrics(self) -> None:
+        """Raise `RunError` if metrics.csv is not what the newest intact checkpoint says it was."""
+        for folder in sorted((self.path / "checkpoints").glob("[0-9]*"), reverse=True):
+            try:
+                seals = json.loads(files.read_bytes(folder / checkpoint.COMMIT))["seals"]
+                sealed = seals["metrics"]
+            except (OSError, ValueError, KeyError, TypeError):
+                continue  # damaged, or written by an older version
+            why = self.differs(sealed)
+            if why is None:
+                return
+            ours = record.stranger(self.config, seals["record"]) is None
+            if ours and checkpoint.damage(folder) is None:
+                raise RunError(
+                    f"{why}; `credo resume` goes on from the newest checkpoint it agrees with"
+                )
+
+
+def _json(text: str | None) -> Any:
+    try:
+        return json.loads(text or "null")
+    except ValueError:
+        return None
