@@ -269,9 +269,9 @@ def test_workers_end_with_a_parent_that_is_killed():
 
 def test_what_a_stranger_recorded_is_not_trusted_by_a_worker(tmp_path):
     job = local.Job(tmp_path, ALGORITHM, 0, FIVE)
-    assert json.loads(job.message())["trust"] is True
+    assert json.loads(job.message())["again"]["trust"] is True
     tree = json.loads(json.dumps(config.to_tree(ALGORITHM))) | {"class": "nowhere:Algorithm"}
     job = local.Job(tmp_path, tree, 0, FIVE)
-    assert json.loads(job.message())["trust"] is False  # and nothing was imported for it
+    assert json.loads(job.message())["again"]["trust"] is False  # and nothing was imported for it
     assert config.changed(tree, tree) == []
     assert os.listdir(tmp_path) == []

@@ -4,7 +4,6 @@ import hashlib
 import json
 import os
 import shutil
-import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -30,10 +29,9 @@ def names(folder: Path) -> list[str]:
 
 @pytest.fixture
 def written(tmp_path):
-    journal = log.Log(tmp_path, 0, tensorboard=False)
+    journal = log.Log(tmp_path, 0)
     journal.append(rows(1, 3), 1.0, 1.0)
     journal.append(rows(4, 5), 0.5, 1.5)
-    journal.close()
     return tmp_path
 
 
@@ -55,13 +53,13 @@ def test_the_clock_is_kept_apart_one_row_per_dispatch(written):
 def test_sync_puts_both_files_on_the_disk(written, monkeypatch):
     synced = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_ino))
-    log.Log(written, 5, tensorboard=False).sync()
+    log.Log(written, 5).sync()
     paths = (written / "metrics.csv", written, written / "timing.csv")
     assert synced == [path.stat().st_ino for path in paths]
 
 
 def test_nan_and_infinity_come_back(tmp_path):
-    journal = log.Log(tmp_path, 0, tensorboard=False)
+    journal = log.Log(tmp_path, 0)
     journal.append([{"generation": 1, "a": float("nan"), "b": float("-inf")}], 1.0, 1.0)
     columns = log.read(tmp_path / "metrics.csv")
     assert np.isnan(columns["a"]).tolist() == [True]
@@ -73,7 +71,7 @@ def test_a_resumed_log_is_cut_to_its_checkpoint(written, tail):
     metrics = written / "metrics.csv"
     whole = metrics.read_bytes()
     metrics.write_bytes(whole + tail)
-    journal = log.Log(written, 3, tensorboard=False)
+    journal = log.Log(written, 3)
     assert metrics.read_bytes() == b"".join(whole.splitlines(keepends=True)[:4])
     assert log.read(written / "timing.csv")["generation"].tolist() == [3]
     journal.append(rows(4, 5), 0.5, 1.5)
@@ -90,7 +88,7 @@ def test_a_half_written_line_is_not_read(written, tail):
 
 def test_a_log_cut_to_nothing_starts_with_its_header_again(written):
     whole = (written / "metrics.csv").read_bytes()
-    journal = log.Log(written, 0, tensorboard=False)
+    journal = log.Log(written, 0)
     assert log.read(written / "metrics.csv") == {}
     journal.append(rows(1, 5), 1.0, 1.0)
     assert (written / "metrics.csv").read_bytes() == whole
@@ -102,46 +100,6 @@ def test_there_is_nothing_to_read_before_the_first_row(tmp_path):
     assert log.read(tmp_path / "metrics.csv") == {}
 
 
-def events(folder: Path) -> list:
-    """All events in the one file of `folder`, their checksums checked."""
-    from tensorboardX.proto.event_pb2 import Event
-    from tensorboardX.record_writer import masked_crc32c
-
-    (path,) = folder.iterdir()
-    data, found = path.read_bytes(), []
-    while data:
-        (size,) = struct.unpack("<Q", data[:8])
-        body = data[12 : 12 + size]
-        sums = struct.unpack("<I", data[8:12]) + struct.unpack("<I", data[12 + size : 16 + size])
-        assert sums == (masked_crc32c(data[:8]), masked_crc32c(body))
-        found.append(Event.FromString(body))
-        data = data[16 + size :]
-    return found
-
-
-def scalars(folder: Path) -> list[tuple[str, float, int]]:
-    return [(v.tag, v.simple_value, e.step) for e in events(folder) for v in e.summary.value]
-
-
-def test_tensorboard_gets_every_finite_metric_of_every_generation(tmp_path):
-    journal = log.Log(tmp_path, 0)
-    nan = float("nan")
-    journal.append([{"generation": 1, "a": 0.5, "b": 2}, {"generation": 2, "a": nan, "b": 3}], 1, 1)
-    folder = tmp_path / "tensorboard"
-    expected = [("a", 0.5, 1), ("b", 2.0, 1), ("b", 3.0, 2)]
-    assert scalars(folder) == expected  # at once, not when something is flushed
-    journal.append([{"generation": 3, "a": 1, "b": 4}], 1, 1)
-    journal.close()
-    assert scalars(folder) == [*expected, ("a", 1.0, 3), ("b", 4.0, 3)]
-    first, second, *_ = events(folder)
-    assert (first.file_version, second.step, second.session_log.status) == ("brain.Event:2", 1, 1)
-
-
-def test_events_of_a_resumed_run_void_those_that_come_again(written):
-    log.Log(written, 5)
-    assert events(written / "tensorboard")[1].step == 6
-
-
 def refuse(directory: Path, name: str) -> None:
     """Let no file of this name be written, whoever the user is."""
     path = directory / name
@@ -149,26 +107,8 @@ def refuse(directory: Path, name: str) -> None:
     path.mkdir()
 
 
-def test_without_room_for_events_training_goes_on(tmp_path):
-    (tmp_path / "tensorboard").write_text("a file")
-    with pytest.warns(UserWarning, match=r"events are not written: .*; training goes on"):
-        journal = log.Log(tmp_path, 0)
-    journal.append(rows(1, 3), 1.0, 1.0)
-    journal.close()
-    assert log.read(tmp_path / "metrics.csv")["generation"].tolist() == [1, 2, 3]
-
-
-def test_events_that_fail_later_are_dropped_with_one_warning(tmp_path):
-    journal = log.Log(tmp_path, 0)
-    refuse(tmp_path / "tensorboard", next((tmp_path / "tensorboard").iterdir()).name)
-    with pytest.warns(UserWarning, match=r"no longer written: .*events\.out.*; training goes on"):
-        journal.append(rows(1, 1), 1.0, 1.0)
-    journal.append(rows(2, 2), 1.0, 1.0)
-    assert log.read(tmp_path / "metrics.csv")["generation"].tolist() == [1, 2]
-
-
 def test_a_clock_that_cannot_be_written_stops_nothing(written):
-    journal = log.Log(written, 5, tensorboard=False)
+    journal = log.Log(written, 5)
     refuse(written, "timing.csv")
     more = [{"generation": 6, "score": 0.0, "nan": 0}, {"generation": 7, "score": 0.0, "nan": 0}]
     with pytest.warns(UserWarning, match=r"timing\.csv is no longer written: .*; training goes on"):
@@ -191,16 +131,16 @@ def test_a_clock_that_cannot_be_written_stops_nothing(written):
 def test_a_damaged_clock_is_begun_anew(written, content):
     (written / "timing.csv").write_bytes(content)
     with pytest.warns(UserWarning, match=r"timing\.csv is .*; timing\.csv is begun anew: "):
-        journal = log.Log(written, 5, tensorboard=False)
+        journal = log.Log(written, 5)
     assert journal.elapsed == 0.0
     journal.append([{"generation": 6, "score": 0.0, "nan": 0}], 0.5, 2.0)
     assert log.read(written / "timing.csv")["seconds"].tolist() == [2.0]
 
 
 def test_the_clock_goes_on(written):
-    assert log.Log(written, 5, tensorboard=False).elapsed == 1.5
-    assert log.Log(written, 4, tensorboard=False).elapsed == 1.0
-    assert log.Log(written, 0, tensorboard=False).elapsed == 0.0
+    assert log.Log(written, 5).elapsed == 1.5
+    assert log.Log(written, 4).elapsed == 1.0
+    assert log.Log(written, 0).elapsed == 0.0
 
 
 def test_rows_that_are_done_and_gone_are_an_error(written):
@@ -227,7 +167,7 @@ def test_a_seal_is_of_the_rows_up_to_its_generation(written):
 
 def test_a_seal_hashes_no_row_twice(written):
     """What a process has sealed stays sealed, whatever happens to the file since."""
-    journal, metrics = log.Log(written, 5, tensorboard=False), written / "metrics.csv"
+    journal, metrics = log.Log(written, 5), written / "metrics.csv"
     log.seal(written, 5)
     journal.append([{"generation": 6, "score": 0.5, "nan": 0}], 0.5, 2.0)
     whole = metrics.read_bytes()
@@ -240,7 +180,7 @@ def test_a_seal_hashes_no_row_twice(written):
 
 def test_a_table_that_was_cut_is_sealed_anew(written):
     log.seal(written, 5)
-    journal = log.Log(written, 3, tensorboard=False)
+    journal = log.Log(written, 3)
     journal.append([row | {"score": 0.5} for row in rows(4, 6)], 1.0, 2.0)
     found = log.seal(written, 6)
     assert found["sha256"] == hashlib.sha256((written / "metrics.csv").read_bytes()).hexdigest()
@@ -296,7 +236,7 @@ def test_the_last_row_must_fit_the_header(written):
 
 def test_a_pipe_is_no_table_and_waits_for_nobody(tmp_path):
     os.mkfifo(tmp_path / "metrics.csv")
-    for action in (log.read, log.last, lambda path: log.Log(path.parent, 0, tensorboard=False)):
+    for action in (log.read, log.last, lambda path: log.Log(path.parent, 0)):
         with pytest.raises(OSError, match=r"no regular file.*metrics\.csv"):
             action(tmp_path / "metrics.csv")
 
@@ -309,7 +249,7 @@ def test_nothing_is_written_through_a_link(written, name):
     before = victim.read_bytes()
     path.unlink(missing_ok=True)
     path.symlink_to(victim)
-    journal = log.Log(written, 3, tensorboard=False)
+    journal = log.Log(written, 3)
     journal.append(rows(4, 5), 1.0, 1.0)
     assert victim.read_bytes() == before
     assert log.read(written / "metrics.csv")["generation"].tolist() == [1, 2, 3, 4, 5]
@@ -319,27 +259,31 @@ def test_a_copy_made_of_links_stays_as_it_was(written):
     copy = written.parent / f"{written.name}-copy"
     shutil.copytree(written, copy, copy_function=os.link)
     before = (copy / "metrics.csv").read_bytes()
-    log.Log(written, 5, tensorboard=False).append([rows(5, 5)[0] | {"generation": 6}], 1.0, 1.0)
+    log.Log(written, 5).append([rows(5, 5)[0] | {"generation": 6}], 1.0, 1.0)
     assert (copy / "metrics.csv").read_bytes() == before
 
 
 LIMITED = """
 import resource, sys, warnings
 from pathlib import Path
-from credo.runs import log
+from types import SimpleNamespace
+from credo.runs import callbacks, log
 directory, size = Path(sys.argv[1]), int(sys.argv[2])
 warnings.simplefilter("always")
 warnings.showwarning = lambda message, *_: print("warned:", message)
 journal = log.Log(directory, 0)
+run, board = SimpleNamespace(path=directory), [callbacks.TensorBoard()]
+listeners = callbacks.Listeners(run, board, 0.0, True)
 resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 g = 0
 try:
     while g < 2000:
-        journal.append([{"generation": g + i, "value": 0.5} for i in (1, 2, 3)], 1.0, 1.0)
+        rows = [{"generation": g + i, "champion_score": 0.5} for i in (1, 2, 3)]
+        journal.append(rows, 1.0, 1.0)
+        listeners.hear(rows)
         g += 3
 except OSError as error:
     print("error:", error)
-journal.close()
 print("done:", g)
 """
 
@@ -349,7 +293,7 @@ def test_where_no_file_may_grow_metrics_are_an_error_and_events_are_not(tmp_path
     command = [sys.executable, "-c", LIMITED, str(tmp_path), "4000"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
     warned, *clock, error, last = done.stdout.splitlines()
-    assert warned.startswith("warned: TensorBoard events are no longer written: [Errno 27] File")
+    assert warned.startswith("warned: TensorBoard is no longer told: [Errno 27] File")
     assert clock == []
     assert "metrics.csv" in error
     assert "ulimit -f" in error

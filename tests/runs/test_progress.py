@@ -5,6 +5,7 @@ import pytest
 
 from credo.runs import log
 from credo.runs.budget import Budget, short
+from credo.runs.options import RunOptions
 from credo.runs.progress import Progress, clock
 
 ROW = {"champion_score": 0.5, "fitness_max": 12.345}
@@ -64,8 +65,8 @@ def test_a_budget_is_reached_by_its_first_limit(generation, frames, score, reach
 def test_a_budget_has_a_limit():
     with pytest.raises(ValueError, match="give generations, frames or both"):
         Budget()
-    assert Budget.of(None, frames=1e6) == Budget(frames=1_000_000)
-    assert Budget.of(None) == Budget(generations=1000)
+    assert Budget.of(None, RunOptions(frames=1e6)) == Budget(frames=1_000_000)
+    assert Budget.of(None, RunOptions()) == Budget(generations=1000)
 
 
 def test_short_numbers_and_clocks():
@@ -80,7 +81,7 @@ def test_short_numbers_and_clocks():
 
 
 def test_the_last_row_is_found_without_reading_the_file(tmp_path):
-    journal = log.Log(tmp_path, 0, tensorboard=False)
+    journal = log.Log(tmp_path, 0)
     path = tmp_path / "metrics.csv"
     assert log.last(path) == {}
     for first in range(1, 20_000, 100):
