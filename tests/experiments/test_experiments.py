@@ -16,7 +16,8 @@ from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
 from credo.experiments import base, chapter3, fig_3_4a
 from credo.networks.mmu import MMU
-from credo.report import page
+from credo.report.pages import render
+from credo.report.sections import Page
 from credo.runs import config, executor
 from credo.runs.loop import Run, RunError, train
 
@@ -276,9 +277,7 @@ def test_its_numbers_are_plain_and_its_page_renders(name, runs):
     assert json.loads(base._compact(measured)) == measured
     sections = module.sections(json.loads(text))
     assert len(sections) >= 1
-    html = page.render(
-        page.Page(module.TITLE, module.PUBLISHED, f"credo reproduce {name}", sections)
-    )
+    html = render(Page(module.TITLE, module.PUBLISHED, f"credo reproduce {name}", sections))
     for section in sections:
         assert escape(section.title) in html
     assert ">nan" not in html

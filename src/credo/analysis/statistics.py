@@ -69,7 +69,8 @@ def bootstrap_interval(
     By default whole runs are drawn with replacement and every column has an interval of its
     own: low and high have shape `x.shape[1:]`. With `pooled`, the columns of `x[runs, tasks]`
     are strata: each task draws its own runs, the statistic pools all of them, and low and high
-    are scalars (the stratified bootstrap of Agarwal et al.). One run has no interval: NaN.
+    are scalars (the stratified bootstrap of Agarwal et al.). There is no interval, but NaN, of one
+    run and of columns with a value that is not finite.
 
     **Raises:** `ValueError` if `confidence` is not in (0, 1), `resamples` is less than 1, or pooled
     columns are no matrix.
@@ -81,24 +82,41 @@ def bootstrap_interval(
         raise ValueError(f"resamples is {resamples}: it must be at least 1")
     if pooled and x.ndim != 2:
         raise ValueError(f"x has shape {x.shape}: pooled resampling needs [runs, tasks]")
-    if len(x) == 1:
-        nothing = np.full(() if pooled else x.shape[1:], np.nan)
-        return nothing, nothing
+    if pooled:
+        samples, shape = tuple(x.T), ()
+        there = np.array(np.isfinite(x).all())
+    else:
+        columns, shape = x.reshape(len(x), -1), x.shape[1:]
+        there = np.isfinite(columns).all(axis=0)
+        samples = (columns[:, there],)
+    bounds = np.full((2, *there.shape), np.nan)
+    if len(x) > 1 and there.any():
+        found = _percentiles(samples, statistic, confidence, resamples, seed)
+        bounds[:, there] = np.reshape(found, (2, -1))
+    low, high = bounds.reshape(2, *shape)
+    return low, high
+
+
+def _percentiles(
+    samples: tuple[Floats, ...], statistic: Statistic, confidence: float, resamples: int, seed: int
+) -> tuple[Floats, Floats]:
+    """The interval over the runs of one sample `[runs, columns]`, or of tasks `[runs]` together."""
 
     def of_tasks(*drawn: Floats, axis: int) -> Floats:
         return statistic(np.stack(drawn, axis=-1), axis=(axis - 1, -1))
 
+    tasks = samples[0].ndim == 1
     found = scipy.stats.bootstrap(
-        tuple(x.T) if pooled else (x,),
-        of_tasks if pooled else statistic,
+        samples,
+        of_tasks if tasks else statistic,
         n_resamples=resamples,
-        batch=None if pooled else max(1, LARGEST_SAMPLE // x.size),
+        batch=None if tasks else max(1, LARGEST_SAMPLE // samples[0].size),
         vectorized=True,
         confidence_level=confidence,
         method="percentile",
         rng=np.random.default_rng(seed),
-    ).confidence_interval
-    return found.low, found.high
+    )
+    return found.confidence_interval
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:

@@ -12,7 +12,8 @@ from typing import Any, Protocol
 
 import equinox as eqx
 
-from ..report.page import Page, write
+from ..report.pages import write
+from ..report.sections import Page
 from ..runs import config, executor, files
 from ..runs.loop import Run, RunError
 
