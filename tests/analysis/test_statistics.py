@@ -2,6 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from credo.analysis.statistics import (
     bootstrap_interval,
@@ -111,6 +112,18 @@ def test_pooled_bootstrap_covers_the_interquartile_mean():
         low, high = bootstrap_interval(x, interquartile_mean, resamples=300, seed=seed, pooled=True)
         covered += low <= 0.0 <= high
     assert 85 <= covered <= 100
+
+
+def test_one_run_has_no_interval():
+    assert np.isnan(bootstrap_interval([1.0])).all()
+    assert np.isnan(bootstrap_interval([[1.0, 2.0]])).tolist() == [[True, True], [True, True]]
+
+
+def test_bootstrap_is_that_of_scipy():
+    x = np.random.default_rng(4).normal(size=(6, 3))
+    rng = np.random.default_rng(0)
+    known = scipy.stats.bootstrap((x,), np.mean, n_resamples=2000, method="percentile", rng=rng)
+    np.testing.assert_array_equal(bootstrap_interval(x), known.confidence_interval)
 
 
 def test_probability_of_improvement_by_hand():

@@ -13,7 +13,8 @@ from credo.environments.sequence_classification import SequenceClassification
 from credo.experiments import base, beyond_3, chapter3, chapter3_gradient, fig_3_11, fig_3_12
 from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
-from credo.report import page
+from credo.report.pages import render
+from credo.report.sections import Page
 from credo.runs.loop import train
 
 NAMES = ("fig-3.4b", "fig-3.9b", "fig-3.11", "fig-3.12", "fig-3.13", "beyond-3")
@@ -82,7 +83,7 @@ def made_up(success, **more):
 
 def rendered(module, measured):
     sections = module.sections(json.loads(json.dumps(measured)))
-    html = page.render(page.Page(module.TITLE, module.PUBLISHED, "credo reproduce x", sections))
+    html = render(Page(module.TITLE, module.PUBLISHED, "credo reproduce x", sections))
     assert ">nan" not in html
     return sections
 

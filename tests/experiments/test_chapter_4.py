@@ -13,7 +13,8 @@ from credo.environments.server_fleet import ServerFleet
 from credo.environments.wrappers import NoisyObservations
 from credo.experiments import base, beyond_4, chapter4, chapter4_fleet, table_4_1
 from credo.networks.dmmu import DMMU
-from credo.report import page
+from credo.report.pages import render
+from credo.report.sections import Page, Table
 from credo.runs.loop import train
 
 NAMES = ("fig-4.2", "fig-4.3", "fig-4.4", "fig-4.7", "fig-4.8", "table-4.1", "beyond-4")
@@ -83,8 +84,8 @@ def test_its_numbers_are_plain_and_its_page_renders(name, runs):
     module = experiment(name)
     measured = module.measure({cell: runs[cell] for cell in CHOSEN[name]}, "smoke")
     assert json.loads(json.dumps(measured)) == measured
-    html = page.render(
-        page.Page(name, module.PUBLISHED, "command", module.sections(measured), {"budget": "smoke"})
+    html = render(
+        Page(name, module.PUBLISHED, "command", module.sections(measured), {"budget": "smoke"})
     )
     assert "nan" not in html.replace("nance", "")
 
@@ -186,7 +187,7 @@ def test_beyond_4_takes_any_of_its_cells(runs):
     alone = "synchronous, dmmu in noise 0.5"
     assert beyond_4.measure({alone: runs[alone]}, "smoke") == {alone: measured[alone]}
     tables = {
-        name: [x.title[:12] for x in beyond_4.sections({name: cell}) if isinstance(x, page.Table)]
+        name: [x.title[:12] for x in beyond_4.sections({name: cell}) if isinstance(x, Table)]
         for name, cell in measured.items()
     }
     assert list(tables.values()) == [

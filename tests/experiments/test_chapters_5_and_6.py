@@ -17,8 +17,9 @@ from credo.experiments import base, chapter5, chapter6, check_td3, fig_5_2, note
 from credo.learners.manager import UCB
 from credo.learners.sac import SAC
 from credo.learners.td3 import ddpg
-from credo.report import page
 from credo.report import run_page as report
+from credo.report.pages import render
+from credo.report.sections import Page
 from credo.rollout import evaluate
 from credo.runs import checkpoint, config, log
 from credo.runs.store import Run
@@ -155,9 +156,7 @@ def test_its_numbers_are_plain_and_its_page_renders(name, runs_of):
     assert json.loads(text) == measured
     assert list(measured) == list(runs)
     sections = module.sections(json.loads(text))
-    html = page.render(
-        page.Page(module.TITLE, module.PUBLISHED, f"credo reproduce {name}", sections)
-    )
+    html = render(Page(module.TITLE, module.PUBLISHED, f"credo reproduce {name}", sections))
     for section in sections:
         assert escape(section.title) in html
     assert ">nan" not in html

@@ -13,7 +13,7 @@ from credo.environments.extended_tmaze import ExtendedTMaze
 from credo.environments.wrappers import DelayedReward
 from credo.networks.mmu import MMU
 from credo.networks.team import Team
-from credo.report import maze_page, page
+from credo.report import maze_page
 from credo.report.watch import watch
 from credo.runs import checkpoint, config
 from credo.runs.store import Run

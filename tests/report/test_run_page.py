@@ -16,7 +16,7 @@ from credo.environments.sequence_classification import SequenceClassification
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.report import run_page as report
-from credo.report.page import Page
+from credo.report.sections import Page
 from credo.runs import config, evaluation, log
 from credo.runs.loop import train
 from credo.runs.record import RunError

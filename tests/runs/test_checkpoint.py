@@ -712,17 +712,18 @@ import resource, sys
 import numpy as np
 from pathlib import Path
 from credo.runs import checkpoint
-from credo.report import page
+from credo.report.pages import write as write_page
+from credo.report.sections import Page
 directory = Path(sys.argv[1])
-empty = page.Page("title", "lead", "command", [])
+empty = Page("title", "lead", "command", [])
 
 def save(): checkpoint.save(directory / "checkpoints", 2, np.arange(50000), {}, seals={"a": 1})
 def export(): checkpoint.export_policy(directory / "champion.safetensors", np.arange(50000))
-def write(): page.write(page.Page("title", "lead" * 20000, "command", []), directory / "page.html")
+def write(): write_page(Page("title", "lead" * 20000, "command", []), directory / "page.html")
 
 checkpoint.save(directory / "checkpoints", 1, np.arange(5, dtype=np.int32), {})
 checkpoint.export_policy(directory / "champion.safetensors", np.arange(5, dtype=np.int32))
-page.write(empty, directory / "page.html")
+write_page(empty, directory / "page.html")
 before = {path: path.read_bytes() for path in sorted(directory.rglob("*")) if path.is_file()}
 resource.setrlimit(resource.RLIMIT_FSIZE, (60000, 60000))
 for action in (save, export, write):

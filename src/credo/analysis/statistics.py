@@ -1,4 +1,4 @@
-"""Statistics over independent runs: NumPy only, seeded, vectorised over everything but the runs.
+"""Statistics over independent runs: seeded, and vectorised over everything but the runs.
 
 `x` always has the runs on axis 0. A NaN is a missing score: it makes means, quantiles and
 intervals of its column NaN, and it loses every comparison.
@@ -10,12 +10,13 @@ Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical
 from typing import Protocol
 
 import numpy as np
+import scipy.stats
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 Axes = int | tuple[int, ...]
 
-LARGEST_SAMPLE = 4_000_000  # numbers held at once while resampling: 32 MB
+LARGEST_SAMPLE = 4_000_000  # numbers held at once while resampling whole runs: 32 MB
 
 
 class Statistic(Protocol):
@@ -62,49 +63,60 @@ def bootstrap_interval(
     *,
     pooled: bool = False,
 ) -> tuple[Floats, Floats]:
-    """Percentile bootstrap interval (low, high) of `statistic` over the runs of `x[runs, ...]`.
+    """Percentile bootstrap interval (low, high) of `statistic` over the runs of `x[runs, ...]`, by
+    `scipy.stats.bootstrap`.
 
     By default whole runs are drawn with replacement and every column has an interval of its
     own: low and high have shape `x.shape[1:]`. With `pooled`, the columns of `x[runs, tasks]`
     are strata: each task draws its own runs, the statistic pools all of them, and low and high
-    are scalars (the stratified bootstrap of Agarwal et al.).
+    are scalars (the stratified bootstrap of Agarwal et al.). There is no interval, but NaN, of one
+    run and of columns with a value that is not finite.
+
+    **Raises:** `ValueError` if `confidence` is not in (0, 1), `resamples` is less than 1, or pooled
+    columns are no matrix.
     """
     x = over_runs(x)
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence is {confidence}: it must lie in (0, 1)")
     if resamples < 1:
         raise ValueError(f"resamples is {resamples}: it must be at least 1")
-    rng = np.random.default_rng(seed)
-    quantiles = (0.5 - confidence / 2, 0.5 + confidence / 2)
+    if pooled and x.ndim != 2:
+        raise ValueError(f"x has shape {x.shape}: pooled resampling needs [runs, tasks]")
     if pooled:
-        values = pooled_resamples(x, statistic, resamples, rng)
-        low, high = np.quantile(values, quantiles)
-        return low, high
-    runs = x.shape[0]
-    chosen = rng.integers(runs, size=(runs, resamples))
-    columns = x.reshape(runs, -1)
-    width = max(1, LARGEST_SAMPLE // chosen.size)
-    bounds = [
-        np.quantile(statistic(columns[chosen, start : start + width], axis=0), quantiles, axis=0)
-        for start in range(0, columns.shape[1], width)
-    ]
-    low, high = np.concatenate(bounds, axis=1).reshape(2, *x.shape[1:])
+        samples, shape = tuple(x.T), ()
+        there = np.array(np.isfinite(x).all())
+    else:
+        columns, shape = x.reshape(len(x), -1), x.shape[1:]
+        there = np.isfinite(columns).all(axis=0)
+        samples = (columns[:, there],)
+    bounds = np.full((2, *there.shape), np.nan)
+    if len(x) > 1 and there.any():
+        found = _percentiles(samples, statistic, confidence, resamples, seed)
+        bounds[:, there] = np.reshape(found, (2, -1))
+    low, high = bounds.reshape(2, *shape)
     return low, high
 
 
-def pooled_resamples(
-    x: Floats, statistic: Statistic, resamples: int, rng: np.random.Generator
-) -> Floats:
-    """`statistic` over runs and tasks of `x[runs, tasks]`, once per resample: `[resamples]`."""
-    if x.ndim != 2:
-        raise ValueError(f"x has shape {x.shape}: pooled resampling needs [runs, tasks]")
-    block = max(1, LARGEST_SAMPLE // x.size)
-    values = []
-    for start in range(0, resamples, block):
-        count = min(block, resamples - start)
-        chosen = rng.integers(x.shape[0], size=(count, *x.shape))
-        values.append(statistic(x[chosen, np.arange(x.shape[1])], axis=(1, 2)))
-    return np.concatenate(values)
+def _percentiles(
+    samples: tuple[Floats, ...], statistic: Statistic, confidence: float, resamples: int, seed: int
+) -> tuple[Floats, Floats]:
+    """The interval over the runs of one sample `[runs, columns]`, or of tasks `[runs]` together."""
+
+    def of_tasks(*drawn: Floats, axis: int) -> Floats:
+        return statistic(np.stack(drawn, axis=-1), axis=(axis - 1, -1))
+
+    tasks = samples[0].ndim == 1
+    found = scipy.stats.bootstrap(
+        samples,
+        of_tasks if tasks else statistic,
+        n_resamples=resamples,
+        batch=None if tasks else max(1, LARGEST_SAMPLE // samples[0].size),
+        vectorized=True,
+        confidence_level=confidence,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    )
+    return found.confidence_interval
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:

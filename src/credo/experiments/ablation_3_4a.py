@@ -10,7 +10,7 @@ import numpy as np
 from ..algorithms.neuroevolution import Neuroevolution
 from ..analysis import counting
 from ..evolution.curriculum import Curriculum
-from ..report.page import Curve, Figure, Reference, Table
+from ..report.sections import Curve, Figure, Reference, Table
 from ..runs.store import Run
 from . import chapter3
 from .base import Cell

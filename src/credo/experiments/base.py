@@ -13,7 +13,8 @@ from typing import Any, Protocol
 import equinox as eqx
 
 from ..executors import local
-from ..report.page import Page, write
+from ..report.pages import write
+from ..report.sections import Page
 from ..runs import config, files
 from ..runs.options import RunOptions
 from ..runs.record import RunError

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..analysis import counting
 from ..environments.sequence_classification import SequenceClassification
-from ..report.page import Table, Text
+from ..report.sections import Table, Text
 from ..runs.store import Run
 from . import chapter3, chapter3_gradient, fig_3_4a
 from .base import Cell

@@ -15,7 +15,7 @@ from ..environments.extended_tmaze import ExtendedTMaze
 from ..environments.server_fleet import ServerFleet
 from ..environments.wrappers import NoisyObservations
 from ..networks.recurrent import Recurrent
-from ..report.page import Table
+from ..report.sections import Table
 from ..rollout import evaluate
 from ..runs.store import Run
 from . import chapter4, chapter4_fleet, fig_4_7

@@ -15,7 +15,7 @@ from ..environments.sequence_recall import SequenceRecall
 from ..networks.base import AbstractNetwork
 from ..networks.mmu import MMU
 from ..networks.recurrent import Recurrent
-from ..report.page import Curve, Figure
+from ..report.sections import Curve, Figure
 from ..runs.store import Run
 from . import chapter3, fig_3_4a
 from .base import Cell

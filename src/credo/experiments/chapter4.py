@@ -17,7 +17,7 @@ from ..networks.base import AbstractNetwork
 from ..networks.mlp import MLP
 from ..networks.mmu import MMU
 from ..report import maze_page
-from ..report.page import Curve, Figure, HeatMap, Reference, Table, Text, Tracks
+from ..report.sections import Curve, Figure, HeatMap, Reference, Table, Text, Tracks
 from ..rollout import evaluate
 from ..runs.store import Run
 from .base import Cell

@@ -17,7 +17,7 @@ from ..networks.dmmu import DMMU, DMMUPolicy
 from ..networks.mlp import MLP
 from ..networks.recurrent import Recurrent
 from ..networks.team import Centralized, Team
-from ..report.page import Figure, Table, Text
+from ..report.sections import Figure, Table, Text
 from ..rollout import evaluate
 from ..runs.store import Run
 from . import chapter4

@@ -19,7 +19,7 @@ from ..environments.wrappers import DelayedHostReward
 from ..environments.wrappers import delayed as with_delay
 from ..networks.exploration import Explorer, GaussianNoise
 from ..networks.mlp import MLP, ResidualCritic
-from ..report.page import Curve, Figure, Reference, Table, Text
+from ..report.sections import Curve, Figure, Reference, Table, Text
 from ..rollout import evaluate
 from ..runs.store import Run
 from .base import Cell

@@ -10,7 +10,7 @@ from ..algorithms.erl import ERL
 from ..environments.gymnasium import Gymnasium
 from ..learners.td3 import TD3
 from ..report import run_page as report
-from ..report.page import Section, Table
+from ..report.sections import Section, Table
 from ..runs.store import Run
 from . import beyond_5, chapter5
 from .base import Cell

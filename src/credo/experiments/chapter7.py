@@ -15,7 +15,7 @@ from ..environments.rover import Rover
 from ..learners.td3 import TD3, maddpg, matd3
 from ..networks.mlp import Critic
 from ..networks.team import JointCritic, Team
-from ..report.page import Curve, Figure, Reference, Table, Text
+from ..report.sections import Curve, Figure, Reference, Table, Text
 from ..rollout import evaluate
 from ..runs.store import Run
 from .base import Cell

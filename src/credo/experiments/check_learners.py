@@ -9,7 +9,7 @@ from ..learners.sac import SAC
 from ..learners.td3 import TD3, TD3_NETWORK, ddpg
 from ..networks.exploration import GaussianNoise
 from ..networks.mlp import MLP, Critic
-from ..report.page import Reference
+from ..report.sections import Reference
 from . import chapter5
 from .base import Cell
 from .chapter5 import Plan

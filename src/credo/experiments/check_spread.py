@@ -13,7 +13,7 @@ from ..learners.td3 import maddpg, matd3
 from ..networks.exploration import GaussianNoise
 from ..networks.mlp import Critic
 from ..networks.team import JointCritic, Team
-from ..report.page import Curve, Figure, Reference, Table, Text
+from ..report.sections import Curve, Figure, Reference, Table, Text
 from ..rollout import evaluate
 from ..runs.store import Run
 from . import chapter7

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ..report.page import Curve, Figure, Reference, Table, Text
+from ..report.sections import Curve, Figure, Reference, Table, Text
 from ..runs.store import Run
 from . import chapter3, chapter3_gradient, fig_3_4a, fig_3_5a, fig_3_5b
 from .base import Cell

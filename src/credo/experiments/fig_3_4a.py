@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from ..analysis import floors
-from ..report.page import Curve, Figure, Reference, Table, Text
+from ..report.sections import Curve, Figure, Reference, Table, Text
 from ..runs.store import Run
 from . import chapter3
 from .base import Cell

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from ..environments.sequence_classification import SequenceClassification
-from ..report.page import Curve, Figure, Reference, Table
+from ..report.sections import Curve, Figure, Reference, Table
 from ..runs.store import Run
 from . import chapter3, fig_3_4a
 from .base import Cell

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..analysis import floors
-from ..report.page import Curve, Figure, Reference, Table
+from ..report.sections import Curve, Figure, Reference, Table
 from ..runs.store import Run
 from . import chapter3, fig_3_4a
 from .base import Cell

@@ -8,7 +8,7 @@ import numpy as np
 from .. import tree
 from ..analysis import memory
 from ..environments.sequence_classification import SequenceClassification
-from ..report.page import HeatMap, Table
+from ..report.sections import HeatMap, Table
 from ..runs.store import Run
 from . import chapter3
 from .base import Cell

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ..report.page import HeatMap, Table
+from ..report.sections import HeatMap, Table
 from . import chapter4_fleet, table_4_1
 from .base import Cell
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..algorithms.erl import ERL
 from ..algorithms.off_policy import OffPolicy
-from ..report.page import Reference, Table
+from ..report.sections import Reference, Table
 from ..runs.store import Run
 from . import chapter5
 from .base import Cell

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..algorithms.erl import ERL
 from ..evolution.selection import Uniform
-from ..report.page import Table
+from ..report.sections import Table
 from . import chapter5
 from .base import Cell
 

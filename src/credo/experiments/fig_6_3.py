@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ..report.page import Reference
+from ..report.sections import Reference
 from . import chapter5, chapter6
 from .base import Cell
 

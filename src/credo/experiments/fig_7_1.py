@@ -7,7 +7,7 @@ import numpy as np
 from ..environments.rover import Rover
 from ..evolution.mutation import MatrixMutation
 from ..networks.team import Team
-from ..report.page import Table
+from ..report.sections import Table
 from ..runs.store import Run
 from . import chapter7
 from .base import Cell

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..report import replay_page, trajectories
-from ..report.page import Drawing, Table
+from ..report.sections import Drawing, Table
 from ..runs.store import Run
 from . import chapter7
 from .base import Cell

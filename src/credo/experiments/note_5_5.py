@@ -7,7 +7,7 @@ import numpy as np
 from ..algorithms.erl import ERL
 from ..algorithms.off_policy import OffPolicy
 from ..analysis import attribution
-from ..report.page import Table
+from ..report.sections import Table
 from ..runs import log
 from ..runs.store import Run
 from . import chapter5

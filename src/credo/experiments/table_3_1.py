@@ -7,7 +7,7 @@ import numpy as np
 from .. import tree
 from ..analysis import memory
 from ..environments.sequence_classification import SequenceClassification
-from ..report.page import Table, Text
+from ..report.sections import Table, Text
 from ..runs.store import Run
 from . import chapter3
 from .base import Cell

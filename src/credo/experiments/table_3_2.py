@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from ..analysis import counting
-from ..report.page import Table
+from ..report.sections import Table
 from ..runs.store import Run
 from . import chapter3
 from .base import Cell

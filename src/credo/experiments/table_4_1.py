@@ -9,7 +9,7 @@ import numpy as np
 from ..analysis import fleet
 from ..environments.server_fleet import ServerFleet
 from ..networks.dmmu import DMMU
-from ..report.page import Table
+from ..report.sections import Table
 from ..runs.store import Run
 from . import chapter4_fleet
 from .base import Cell

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..analysis import attribution
-from ..report.page import Table
+from ..report.sections import Table
 from ..runs.store import Run
 from . import chapter5
 from .base import Cell

@@ -11,8 +11,8 @@ import numpy as np
 from ..analysis.maze_trace import MazeTrace, trace_maze
 from ..environments.extended_tmaze import ExtendedTMaze
 from ..networks.base import AbstractPolicy
-from . import page
-from .page import HeatMap, Page, Tracks
+from . import pages
+from .sections import HeatMap, Page, Section, Track, Tracks
 
 DEEPEST = 4  # 48 trials: more are no picture
 
@@ -45,13 +45,13 @@ def pictures(title: str, episode: dict[str, Any]) -> list[Tracks | HeatMap]:
     n, robots = 2 ** episode["depth"], len(episode["endpoint"])
     names = [f"robot {i + 1}" for i in range(robots)] if robots > 1 else ["robot"]
     tracks = [
-        page.Track(name, rows, [_told(*told) for told in zip(company, reward, strict=True)])
+        Track(name, rows, [_told(*told) for told in zip(company, reward, strict=True)])
         for name, rows, company, reward in zip(
             *(names, episode["endpoint"], episode["company"], episode["reward"]), strict=True
         )
     ]
     if episode["partner"] is not None:
-        tracks.append(page.Track("static robot", episode["partner"], scripted=True))
+        tracks.append(Track("static robot", episode["partner"], scripted=True))
     trials = [str(trial + 1) for trial in range(3 * n)]
     walk = Tracks(
         title,
@@ -112,8 +112,8 @@ def write(
     beside = f" beside a static one ({env.partner.upper()})" if env.partner else ""
     robots = "1 robot" if env.robots == 1 else f"{env.robots} robots"
     lead = f"The champion: {robots}{beside}, {env.depth}-deep, {env.objective.capitalize()}."
-    sections: list[page.Section] = []
+    sections: list[Section] = []
     for seed in seeds:
         trace = trace_maze(env, policy, key=jax.random.key(seed))
         sections += pictures(f"Seed {seed}", plain(env, trace))
-    return page.write(Page(title, lead, command="", sections=sections), path)
+    return pages.write(Page(title, lead, command="", sections=sections), path)

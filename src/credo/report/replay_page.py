@@ -23,7 +23,8 @@ from ..networks.base import AbstractPolicy
 from ..rollout import world_keys
 from ..runs import files
 from ..types import TimeStep
-from .page import Page, render
+from .pages import render
+from .sections import Page
 
 SPEEDS = (1, 2, 5, 10, 20)  # steps per second to choose from
 
@@ -122,7 +123,7 @@ def write(
 
 
 def player(env: Rover, episodes: Sequence[Episode], *, speed: float = 5) -> str:
-    """HTML that plays the episodes; part of a page with the style of `credo.report.page`. Several
+    """HTML that plays the episodes; part of a page with the style of `credo.report.pages`. Several
     can stand in one page.
 
     **Arguments:** `speed`: steps per second at first, more than 0.

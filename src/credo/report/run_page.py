@@ -4,15 +4,16 @@ It reads what runs have recorded: no environment is opened, and no code that a r
 imported but Credo's own. So a page about a stranger's run needs no trust in them.
 """
 
+import itertools
 import json
 import pathlib
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..analysis import attribution, floors, statistics
+from ..analysis import attribution, floors
 from ..environments.base import AbstractSequenceTask
 from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
@@ -21,48 +22,189 @@ from ..learners.base import AbstractLearner
 from ..runs import config
 from ..runs.record import RunError
 from ..runs.store import Run
-from .page import Curve, Figure, Page, Reference, Section, Table
-from .page import write as write_page
+from .pages import write as write_page
+from .sections import Curve, Figure, Page, Reference, Section, Summary, Table
+
+Tree = Mapping[str, Any]  # of a record: an object as `config.to_tree` makes it
+Groups = Mapping[str, list[Run]]  # runs that differ in their seed alone, by label
+
+MOST_FIELDS = 3  # in a label
 
 
-def write(paths: list[pathlib.Path], target: pathlib.Path) -> pathlib.Path:
-    """Runs that differ in their seed alone are one curve. Returns the page's path."""
+def write(
+    paths: Sequence[pathlib.Path],
+    target: pathlib.Path,
+    *,
+    labels: Sequence[str] | None = None,
+) -> pathlib.Path:
+    """Write a page about runs to `target` and return it. Runs that differ in their seed alone are
+    one curve; `labels`: what to call those curves, in order of the first run of each.
+
+    **Raises:** `RunError` if a path is no run, a run has no generation yet, or there are not as
+    many labels as curves.
+    """
     groups: dict[str, list[Run]] = {}
     for path in paths:
         run = Run(path)
         if not run.metrics:
             raise RunError(f"{path} has no generation yet: wait for its first, or resume it")
         groups.setdefault(json.dumps(run.config["algorithm"]), []).append(run)
-    labels = _labels([json.loads(key) for key in groups])
-    runs = dict(zip(labels, groups.values(), strict=True))
-    first = paths[0].name if len(paths) == 1 else f"{len(paths)} runs"
-    machine = next(iter(runs.values()))[0].config["machine"]
-    page = Page(
-        title=f"Credo: {first}",
-        lead=_lead(runs),
-        command="credo report " + shlex.join(map(str, paths)),
-        sections=[
-            _figure(runs, "champion_score", "Champion on fresh episodes, as last tested"),
-            *_improved(runs),
-            _table(runs),
-            *_attributions(runs),
-            _settings(runs),
-        ],
-        facts={
-            "machine": f"{machine['processor']}, {machine['cores']} cores, {machine['system']}",
-            "versions": ", ".join(f"{k} {v}" for k, v in machine["versions"].items()),
-            "seeds": "; ".join(
-                f"{label}: {', '.join(str(r.config['seed']) for r in group)}"
-                for label, group in runs.items()
-            ),
-        },
-    )
+    names = group_labels([json.loads(key) for key in groups])
+    if labels is not None:
+        if len(set(labels)) != len(labels) or len(labels) != len(names):
+            raise RunError(
+                f"{len(set(labels))} different labels are given for {len(names)} curves: give one "
+                f"for each of {'; '.join(names)}"
+            )
+        names = list(labels)
+    runs = dict(zip(names, groups.values(), strict=True))
     target.parent.mkdir(parents=True, exist_ok=True)
-    write_page(page, target)
+    write_page(describe(runs, paths), target)
     return target
 
 
-def _improved(runs: dict[str, list[Run]]) -> list[Figure]:
+def describe(runs: Groups, paths: Sequence[pathlib.Path]) -> Page:
+    """The page about runs."""
+    first = paths[0].name if len(paths) == 1 else f"{len(paths)} runs"
+    every = [run for group in runs.values() for run in group]
+    machines = [run.config["machine"] for run in every]
+    return Page(
+        title=f"Credo: {first}",
+        lead=_lead(every),
+        command="credo report " + shlex.join(map(str, paths)),
+        sections=[
+            _figure(runs, "champion_score", "Best policy on fresh episodes, as last tested"),
+            *_improved(runs),
+            _table(runs),
+            *_attributions(runs),
+            *_settings(runs),
+        ],
+        facts={
+            "seeds": [
+                f"{label}: {', '.join(str(run.config['seed']) for run in group)}"
+                for label, group in runs.items()
+            ],
+            "machine": _once(
+                f"{m['processor']}, {m['cores']} cores, {m['system']}" for m in machines
+            ),
+            "versions": _once(
+                ", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines
+            ),
+        },
+    )
+
+
+def _once(texts: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(texts))
+
+
+def _lead(runs: Sequence[Run]) -> str:
+    tasks = {config.brief(run.config["algorithm"]["env"]) for run in runs}
+    return f"Task: {'; '.join(sorted(tasks))}."
+
+
+# ------------------------------------------------------------------------------------------- labels
+
+
+def word(tree: Tree) -> str:
+    """What the command line calls the algorithm of a record: `td3`, `cerl`, `ea`; of one's own the
+    name of its class."""
+    name = _class(tree)
+    if name == "ERL":
+        return ("ea", "erl", "cerl")[min(len(tree.get("learners", ())), 2)]
+    if name == "OffPolicy":
+        return _learner_word(tree["learner"])
+    return name.lower() if tree["class"].startswith("credo.algorithms.") else name
+
+
+def _learner_word(learner: Tree) -> str:
+    """DDPG is TD3 less its three additions, and has one critic; the critics of MATD3 and MADDPG see
+    the whole team."""
+    name = _class(learner)
+    if name != "TD3":
+        return name.lower() if learner["class"].startswith("credo.learners.") else name
+    single = learner.get("critics") == learner.get("policy_delay") == 1
+    team = _class(learner.get("critic") or {"class": ""}) == "JointCritic"
+    return ("ma" if team else "") + ("ddpg" if single else "td3")
+
+
+def _class(tree: Tree) -> str:
+    return tree["class"].partition(":")[2]
+
+
+def group_labels(trees: Sequence[Tree]) -> list[str]:
+    """What tells algorithms apart: the word of each and, where two share it, at most three fields
+    in which these differ."""
+    words = [word(tree) for tree in trees]
+    flat = [config.flatten(_indexed(tree)) for tree in trees]
+    labels = list(words)
+    for name in dict.fromkeys(words):
+        same = [i for i, other in enumerate(words) if other == name]
+        if len(same) > 1:
+            fields = telling([flat[i] for i in same])
+            for i in same:
+                told = [f"{_short(key, fields)} {_text(flat[i].get(key))}" for key in fields]
+                labels[i] = f"{name}: {', '.join(told)}"
+    return numbered(labels)
+
+
+def telling(flat: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The fewest fields, at most three, by which settings can be told apart, or nearly so."""
+    keys = differing(flat)
+
+    def kinds(fields: Sequence[str]) -> int:
+        return len({tuple(str(tree.get(key)) for key in fields) for tree in flat})
+
+    # Of many fields, the pairs and triples of those that tell most.
+    keys = sorted(keys, key=lambda key: -kinds([key]))[:12]
+    choices = [
+        fields
+        for size in range(1, MOST_FIELDS + 1)
+        for fields in itertools.combinations(keys, size)
+    ]
+    return list(max(choices, key=lambda fields: (kinds(fields), -len(fields))))
+
+
+def differing(flat: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Fields that are not the same everywhere."""
+    keys = dict.fromkeys(key for tree in flat for key in tree)
+    return [key for key in keys if len({str(tree.get(key)) for tree in flat}) > 1]
+
+
+def numbered(names: Sequence[str]) -> list[str]:
+    """Names that differ: a number behind one that is there several times."""
+    return [
+        f"{name} ({names[:i].count(name) + 1})" if names.count(name) > 1 else name
+        for i, name in enumerate(names)
+    ]
+
+
+def _short(key: str, others: Sequence[str]) -> str:
+    """The last part of a field's name, if no other field of a label has it."""
+    last = key.rpartition(".")[2]
+    alone = sum(other.rpartition(".")[2] == last for other in others) == 1
+    return last if alone and not last.isdigit() else key
+
+
+def _text(value: Any, most: int = 24) -> str:
+    text = "none" if value is None else str(value)
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def _indexed(tree: Any) -> Any:
+    """A config tree whose lists of objects are dicts of them, so that each field has a name:
+    `learners.0.gamma`."""
+    if isinstance(tree, dict):
+        return {key: _indexed(value) for key, value in tree.items()}
+    if isinstance(tree, list) and any(isinstance(value, dict) for value in tree):
+        return {str(i): _indexed(value) for i, value in enumerate(tree)}
+    return tree
+
+
+# ------------------------------------------------------------------------------------------- scores
+
+
+def _improved(runs: Groups) -> list[Figure]:
     """What each algorithm improves: fitness, or a loss."""
     titles = {"fitness_max": "Best fitness of each generation", "loss": "Loss of each generation"}
     found = []
@@ -77,43 +219,14 @@ def _improved(runs: dict[str, list[Run]]) -> list[Figure]:
     return found
 
 
-def _lead(runs: dict[str, list[Run]]) -> str:
-    tasks = {config.brief(r.config["algorithm"]["env"]) for group in runs.values() for r in group}
-    return f"Task: {'; '.join(sorted(tasks))}."
-
-
-def _labels(trees: list[dict[str, Any]]) -> list[str]:
-    """What tells groups of runs apart: the fields in which they differ."""
-    names = [tree["class"].partition(":")[2] for tree in trees]
-    if len(trees) == 1:
-        return names
-    flat = [config.flatten(_indexed(tree)) for tree in trees]
-    keys = dict.fromkeys(key for tree in flat for key in tree)
-    differing = [key for key in keys if len({str(tree.get(key)) for tree in flat}) > 1]
-
-    def named(keys: list[str]) -> list[str]:
-        return [
-            f"{name}: " + ", ".join(f"{key} {tree[key]}" for key in keys if key in tree)
-            for name, tree in zip(names, flat, strict=True)
-        ]
-
-    short = named(differing[:3])
-    return short if len(set(short)) == len(short) else named(differing)
-
-
-def _figure(runs: dict[str, list[Run]], metric: str, title: str) -> Figure:
-    curves, references = [], []
+def _figure(runs: Groups, metric: str, title: str) -> Figure:
     budgets = [run.config.get("budget", {}) for group in runs.values() for run in group]
     unit = "frames" if all(budget.get("frames") for budget in budgets) else "generation"
-    for label, group in runs.items():
-        curves.append(_curve(label, group, metric, unit))
-        task = _task(group[0])
-        if metric == "champion_score" and task is not None and not references:
-            known = floors.floor(task) if floors.known(task) else None
-            if known is not None:
-                references.append(Reference(f"floor: {known[0]}", known[1]))
-            references.append(Reference("ceiling", 1.0))
-    return Figure(title, unit, metric.replace("_", " "), curves, tuple(references))
+    curves = [_curve(label, group, metric, unit) for label, group in runs.items()]
+    known = [_bounds(group[0]) for group in runs.values()] if metric == "champion_score" else []
+    levels = dict.fromkeys(level for pair in known if pair for level in pair)
+    names = {"champion_score": "success" if levels else "return"}
+    return Figure(title, unit, names.get(metric, metric.replace("_", " ")), curves, tuple(levels))
 
 
 def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
@@ -128,7 +241,49 @@ def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
     return Curve(label, grid, [attribution.on_grid(c[unit], c[metric], grid) for c in columns])
 
 
-def _attributions(runs: dict[str, list[Run]]) -> list[Section]:
+def _bounds(run: Run) -> tuple[Reference, Reference] | None:
+    """The best trivial policy and the upper bound of a run's task, where Credo may know them. No
+    other task is made: that might run somebody's code."""
+    recorded = run.config["algorithm"]["env"]
+    ours = map(config.class_name, (SequenceClassification, SequenceRecall))
+    task: AbstractSequenceTask | None = (
+        config.from_tree(recorded) if recorded["class"] in ours else None
+    )
+    if task is None or not floors.known(task):
+        return None
+    name, value = floors.floor(task)
+    return Reference(f"baseline: {name}", value), Reference("upper bound", floors.CEILING)
+
+
+def _table(runs: Groups) -> Table:
+    known = [_bounds(group[0]) for group in runs.values()]
+    rows = []
+    for (label, group), bounds in zip(runs.items(), known, strict=True):
+        low, high = bounds or (None, None)
+        seeds = [run.config["seed"] for run in group]
+        scores = [float(run.metrics["champion_score"][-1]) for run in group]
+        last = min(int(run.metrics["generation"][-1]) for run in group)
+        told = [f"{low.value:.3f} ({low.label.partition(': ')[2]})" if low else None]
+        told += [Summary(scores, seeds), high.value if high else None]
+        rows.append([label, len(group), last, *told])
+    columns = ["algorithm", "seeds", "generations", "baseline", "best policy", "upper bound"]
+    caption = f"On {_episodes(runs)} fresh episodes; `credo evaluate` plays more."
+    if not any(known):
+        columns = [name for name in columns if name not in ("baseline", "upper bound")]
+        rows = [[*row[:3], row[4]] for row in rows]
+        caption += " No baseline and no upper bound of this task are known."
+    return Table("Score of the best policy, as last tested", columns, rows, caption)
+
+
+def _episodes(runs: Groups) -> str:
+    each = [group[0].config["algorithm"]["test_episodes"] for group in runs.values()]
+    return " or ".join(str(n) for n in sorted(set(each)))
+
+
+# -------------------------------------------------------------------------------------- attribution
+
+
+def _attributions(runs: Groups) -> list[Section]:
     sections: list[Section] = []
     for label, group in runs.items():
         metrics = [run.metrics for run in group]
@@ -139,15 +294,15 @@ def _attributions(runs: dict[str, list[Run]]) -> list[Section]:
     return sections
 
 
-def attributed(found: dict[str, Any], learners: list[str], title: str = "") -> list[Section]:
+def attributed(found: Mapping[str, Any], learners: list[str], title: str = "") -> list[Section]:
     """What `attribution.summary` found as figures and a table. `title`: put before each title."""
     made = np.array(found["makers"], np.float64)  # [runs, makers, points]
     present = [i for i in range(len(MAKERS)) if np.nanmax(made[:, i], initial=0.0) > 0]
     sections: list[Section] = [
         Figure(
-            f"{title}Who was the last to change the champion",
+            f"{title}Who was the last to change the best policy",
             "frames",
-            "share of champions, mean of a tenth of the run",
+            "share of best policies, mean of a tenth of the run",
             [Curve(MAKERS[i], found["frames"], made[:, i]) for i in present],
             y_range=(0.0, 1.0),
         )
@@ -156,7 +311,7 @@ def attributed(found: dict[str, Any], learners: list[str], title: str = "") -> l
         return sections
     ancestors = [*learners, "first draw"]  # a learner has one colour in both figures
     over_time = {
-        "Where the champion's weights come from": ("ancestry", ancestors, "expected share"),
+        "Where the best policy's weights come from": ("ancestry", ancestors, "expected share"),
         "Workers of each learner so far": ("allocation", learners, "share of all workers"),
     }
     for name, (key, labels, unit) in over_time.items():
@@ -167,16 +322,16 @@ def attributed(found: dict[str, Any], learners: list[str], title: str = "") -> l
     return [*sections, fates(found, learners, title)]
 
 
-def fates(found: dict[str, Any], learners: list[str], title: str = "") -> Table:
-    """Allocation, and the fate of injected actors, mean ± standard error over runs."""
+def fates(found: Mapping[str, Any], learners: list[str], title: str = "") -> Table:
+    """Allocation, and the fate of injected actors, in percent."""
     shares = np.array(found["fates"], np.float64)  # [runs, q, 3]
     allocated = np.array(found["allocated"], np.float64)
-    counts = np.array(found["injected"])
+    injected = np.array(found["injected"])
     rows = [
         [
             name,
             percent(allocated[:, i]),
-            str(int(counts[:, i].sum())),
+            int(injected[:, i].sum()),
             *(percent(shares[:, i, j]) for j in range(len(attribution.FATES))),
         ]
         for i, name in enumerate(learners)
@@ -185,94 +340,46 @@ def fates(found: dict[str, Any], learners: list[str], title: str = "") -> Table:
         f"{title}Learners: their workers, and the fate of their actors in the population",
         ["learner", "workers, %", "injected", *(f"{fate}, %" for fate in attribution.FATES)],
         rows,
-        caption="Mean ± standard error over runs. Injected: actors that were judged, in all runs "
-        "together; the last ones may not have been. Selected: a parent, but no elite.",
+        caption="Injected: actors that were judged, in all runs together; the last ones may not "
+        "have been. Selected: a parent, but no elite.",
     )
 
 
-def percent(shares: np.ndarray) -> str:
-    """Mean ± standard error over runs, in percent; runs without a value are left out."""
-    shares = shares[np.isfinite(shares)]
-    if not shares.size:
-        return "–"
-    mean, error = (100 * float(x) for x in statistics.mean_and_standard_error(shares))
-    return f"{mean:.1f} ± {error:.1f}" if len(shares) > 1 else f"{mean:.1f}"
+def percent(shares: np.ndarray) -> Summary:
+    """Shares `[runs]` in percent."""
+    values = [float(x) if np.isfinite(x) else None for x in shares]
+    return Summary(values, scale=100.0, digits=1)
 
 
-def learner_names(learners: Sequence[AbstractLearner | dict[str, Any]]) -> list[str]:
+def learner_names(learners: Sequence[AbstractLearner | Tree]) -> list[str]:
     """What to call learners, or records of them: their kind and discount, and a number where that
     is not enough."""
-    names = [_learner_name(config.to_tree(learner)) for learner in learners]
-    return [
-        f"{name} ({names[:i].count(name) + 1})" if names.count(name) > 1 else name
-        for i, name in enumerate(names)
-    ]
+    names = []
+    for learner in map(config.to_tree, learners):
+        gamma = learner.get("gamma")
+        kind = _learner_word(learner)
+        kind = kind.upper() if learner["class"].startswith("credo.") else kind
+        names.append(kind if gamma is None else f"{kind} γ {gamma:g}")
+    return numbered(names)
 
 
-def _learner_name(learner: dict[str, Any]) -> str:
-    kind = learner["class"].partition(":")[2]
-    if kind == "TD3" and learner.get("critics") == learner.get("policy_delay") == 1:
-        kind = "DDPG"  # the same mathematics, less three additions
-    gamma = learner.get("gamma")
-    return kind if gamma is None else f"{kind} γ {gamma:g}"
+# ----------------------------------------------------------------------------------------- settings
 
 
-def _task(run: Run) -> AbstractSequenceTask | None:
-    """The task of a run, if it is one whose floor Credo may know. Any other is not made: that might
-    run somebody's code."""
-    recorded = run.config["algorithm"]["env"]
-    ours = map(config.class_name, (SequenceClassification, SequenceRecall))
-    return config.from_tree(recorded) if recorded["class"] in ours else None
-
-
-def _table(runs: dict[str, list[Run]]) -> Table:
-    rows = []
-    for label, group in runs.items():
-        scores = np.array([run.metrics["champion_score"][-1] for run in group])
-        task = _task(group[0])
-        known = None if task is None or not floors.known(task) else floors.floor(task)
-        mean, error = statistics.mean_and_standard_error(scores)
-        spread = (
-            f"{float(mean):.3f} ± {float(error):.3f}" if len(scores) > 1 else f"{scores[0]:.3f}"
-        )
-        rows.append(
-            [
-                label,
-                str(len(group)),
-                str(int(min(run.metrics["generation"][-1] for run in group))),
-                f"{known[1]:.3f} ({known[0]})" if known else "not known",
-                spread,
-                f"{np.median(scores):.3f}",
-                "1" if known else "not known",
-            ]
-        )
-    episodes = next(iter(runs.values()))[0].config["algorithm"]["test_episodes"]
-    return Table(
-        "Score of the champion that was tested last",
-        ["runs", "seeds", "generations", "floor", "mean ± s.e.", "median", "ceiling"],
-        rows,
-        caption=f"On {episodes} fresh episodes; `credo evaluate` plays more.",
+def _settings(runs: Groups) -> list[Table]:
+    """Settings that differ, and all of them, where those are marked."""
+    flat = [config.flatten(_indexed(group[0].config["algorithm"])) for group in runs.values()]
+    keys = list(dict.fromkeys(key for tree in flat for key in tree))
+    marked = set(differing(flat))
+    rows = {key: [key, *(_text(tree[key]) if key in tree else "" for tree in flat)] for key in keys}
+    unlike = [rows[key] for key in keys if key in marked]
+    columns = ["setting", *runs]
+    found = Table(
+        "All settings",
+        columns,
+        list(rows.values()),
+        caption="Marked: settings that differ." if unlike else "",
+        marked=[i for i, key in enumerate(keys) if key in marked],
+        folded=True,
     )
-
-
-def _settings(runs: dict[str, list[Run]]) -> Table:
-    flat = {
-        label: config.flatten(_indexed(group[0].config["algorithm"]))
-        for label, group in runs.items()
-    }
-    keys = dict.fromkeys(key for tree in flat.values() for key in tree)
-    return Table(
-        "Settings",
-        ["field", *flat],
-        [[key, *(str(tree.get(key, "")) for tree in flat.values())] for key in keys],
-    )
-
-
-def _indexed(tree: Any) -> Any:
-    """A config tree whose lists of objects are dicts of them, so that each field has a name:
-    `learners.0.gamma`."""
-    if isinstance(tree, dict):
-        return {key: _indexed(value) for key, value in tree.items()}
-    if isinstance(tree, list) and any(isinstance(value, dict) for value in tree):
-        return {str(i): _indexed(value) for i, value in enumerate(tree)}
-    return tree
+    return [Table("Settings that differ", columns, unlike), found] if unlike else [found]

@@ -5,7 +5,7 @@ records is cheap: it loads neither.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -64,7 +64,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Reference:
-    """A level to compare with: a floor, a published number, a ceiling."""
+    """A level to compare with: a baseline, a published number, an upper bound."""
 
     label: str
     value: float
@@ -76,7 +76,11 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """Curves over a common axis, with the interval of their centre and every seed."""
+    """Curves over a common axis, with the interval of their centre and every seed.
+
+    `joined`: whether a run goes on from one x to the next. Over depth, coupling or another setting
+    each x has runs of its own, which are drawn as dots.
+    """
 
     title: str
     x_label: str
@@ -86,7 +90,8 @@ class Figure:
     caption: str = ""
     log_x: bool = False
     y_range: tuple[float, float] | None = None  # (low, high); widened to show the references
-    centre: Literal["mean", "median"] = "mean"  # the thick line
+    centre: Literal["mean", "median", "iqm"] = "mean"  # the thick line
+    joined: bool = True
 
     def __post_init__(self):
         if not self.curves:
@@ -95,8 +100,8 @@ class Figure:
             raise ValueError(f"figure {self.title!r} has log_x, but an x that is not positive")
         if self.y_range is not None and not self.y_range[0] < self.y_range[1]:
             raise ValueError(f"figure {self.title!r} has y_range {self.y_range}: give (low, high)")
-        if self.centre not in ("mean", "median"):
-            raise ValueError(f"centre is {self.centre!r}: it must be 'mean' or 'median'")
+        if self.centre not in ("mean", "median", "iqm"):
+            raise ValueError(f"centre is {self.centre!r}: it must be 'mean', 'median' or 'iqm'")
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,12 +202,18 @@ class Drawing:
 @dataclass(frozen=True)
 class Table:
     """Rows of cells: numbers are rounded to four digits and right-aligned, strings are shown as
-    given, None and NaN are a dash."""
+    given, None and NaN are a dash.
+
+    `marked`: indices of rows that stand out, such as settings that differ; the caption says why.
+    `folded`: behind its title, until a reader opens it.
+    """
 
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     caption: str = ""
+    marked: Collection[int] = ()
+    folded: bool = False
 
     def __post_init__(self):
         for row in self.rows:
@@ -226,10 +237,15 @@ Section = Drawn | Table | Text
 @dataclass(frozen=True)
 class Page:
     """`command` is what makes the page, exactly as typed; `facts` say where its numbers come
-    from: versions, processor, seeds."""
+    from: versions, processor, seeds; each is one value or several. `banner`: what a reader must
+    know before anything else, such as `SMOKE`."""
 
     title: str
     lead: str
     command: str
     sections: Sequence[Section]
-    facts: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
+    banner: str = ""
+
+
+SMOKE = "This page shows that everything runs. It is no result: tiny networks, seconds of training."

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from ..environments.rover import Rover
 from ..runs import files
-from .plots import DARK, LIGHT, STYLE, Theme, inline
+from .figures import DARK, LIGHT, STYLE, Theme, inline
 from .replay_page import Episode
 
 SIDE = 4.2  # inches

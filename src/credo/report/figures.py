@@ -1,16 +1,14 @@
-"""Figures of a page drawn with matplotlib: SVG for the page, PNG for the rest."""
+"""Figures of a page drawn with matplotlib: SVG for pages, PNG for the rest."""
 
 import io
 import math
-import os
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from html import escape
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -23,104 +21,61 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text as Words
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.transforms import offset_copy
 from numpy.typing import NDArray
 
-from ..analysis.statistics import bootstrap_interval
-from ..runs import files
-from .page import Curve, Figure, HeatMap, Reference, Tracks
+from . import statistics
+from .sections import Curve, Figure, HeatMap, Reference, Tracks
+from .styles import DARK, DASHES, LIGHT, STYLE, Look, Theme, assign
 
 Floats = NDArray[np.float64]
 Plot = Figure | HeatMap | Tracks
+Looks = Mapping[str, Look]  # of curves, by label
 
 WIDTH, HEIGHT = 4.8, 3.1  # inches, without the legend
 MOST_POINTS = 400  # drawn per line
 MOST_SEED_POINTS = 24_000  # drawn per figure by the lines of single seeds
+MOST_TIPS = 100  # points of a curve that a tooltip tells of
+FEW_POINTS = 25  # are marked
+RESAMPLES = 500  # of a curve's interval, for every point at once
 FONT = "system-ui,-apple-system,'Segoe UI',Roboto,'Helvetica Neue',Arial,'DejaVu Sans',sans-serif"
 MARKERS = ("o", "^", "D", "v", "p", "P")  # of tracks
 WALKERS, GOAL = (0, 2, 3, 1, 5), 4  # their colours, and that of their goal, of a theme's curves
-DASHES = ((1, 0), (5, 1.6), (1.3, 1.3), (6, 1.5, 1.3, 1.5))
-
-# `hashsalt` makes the same figure the same text; `parse_math` keeps a $ in a label a $.
-STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "credo",
-    "svg.image_inline": True,
-    "text.parse_math": False,
-    "text.usetex": False,
-    "font.family": ["DejaVu Sans"],
-    "font.size": 9.5,
-    "axes.labelsize": 9.5,
-    "axes.titlesize": 11,
-    "xtick.labelsize": 9,
-    "ytick.labelsize": 9,
-    "legend.fontsize": 9,
-    "axes.linewidth": 0.8,
-    "axes.formatter.limits": (-4, 5),
-    "axes.formatter.useoffset": False,
-    "path.simplify": True,
-    "path.simplify_threshold": 0.2,
-}
 
 
-@dataclass(frozen=True)
-class Theme:
-    """Colours. The curves are those of Okabe & Ito (2008) without the yellow, told apart by the
-    colour-blind; on a dark page the same hues, lighter."""
+class Picture(NamedTuple):
+    """A figure as drawn: an `<svg>` element, and what `tips` says of it."""
 
-    ink: str
-    muted: str
-    grid: str
-    page: str
-    cold: str  # lowest value of a heat map with both signs
-    warm: str  # highest value
-    curves: tuple[str, ...]
+    svg: str
+    tips: dict[str, Any] | None
 
 
-LIGHT = Theme(
-    ink="#1c1f23",
-    muted="#59616b",
-    grid="#e6e9ec",
-    page="#ffffff",
-    cold="#005b96",
-    warm="#c24a00",
-    curves=("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#333333"),
-)
-DARK = Theme(
-    ink="#e4e7eb",
-    muted="#a0a8b2",
-    grid="#2b3037",
-    page="#14171b",
-    cold="#58b2f0",
-    warm="#f08a4b",
-    curves=("#4aa3e6", "#f07f3c", "#22bd8f", "#e097c2", "#f2b441", "#93d3f7", "#e8e8e8"),
-)
-
-
-def figure_svg(figure: Plot, dark: bool = False, *, prefix: str = "") -> str:
+def picture(
+    figure: Plot,
+    dark: bool = False,
+    *,
+    prefix: str = "",
+    looks: Looks | None = None,
+    legend: bool = True,
+) -> Picture:
     """The figure, without its title, as an `<svg>` element that scales with its box.
 
     Text stays text. Every id begins with `prefix`: several figures in one page need different
-    ones, or their clip paths are mixed up. The background is transparent.
+    ones, or their clip paths are mixed up. The background is transparent. `looks`: of curves by
+    their label, as in the other figures of the page; None: of this figure alone. `legend`: whether
+    the picture has one; that of tracks always has.
     """
     with matplotlib.rc_context(STYLE):
         text = io.StringIO()
-        draw(figure, DARK if dark else LIGHT).savefig(text, format="svg", transparent=True)
-    return inline(text.getvalue(), description(figure), prefix)
+        canvas = draw(figure, DARK if dark else LIGHT, looks, legend)
+        canvas.savefig(text, format="svg", transparent=True)
+        return Picture(
+            inline(text.getvalue(), description(figure), prefix), tips(figure, canvas.axes[0])
+        )
 
 
-def save_png(
-    figure: Plot, path: str | os.PathLike[str], dark: bool = False, *, dpi: int = 200
-) -> Path:
-    """Write the figure with its title to `path`; 960 pixels wide at 200 dpi."""
-    theme = DARK if dark else LIGHT
-    with matplotlib.rc_context(STYLE):
-        canvas = draw(figure, theme)
-        if figure.title:
-            canvas.suptitle(textwrap.fill(figure.title, 56), color=theme.ink, fontsize=11)
-        with files.whole(path) as draft:
-            canvas.savefig(draft, format="png", dpi=dpi, facecolor=theme.page)
-    return Path(path)
+# ------------------------------------------------------------------------------- what it says
 
 
 def note(figure: Plot) -> str:
@@ -131,17 +86,43 @@ def note(figure: Plot) -> str:
     if isinstance(figure, Tracks):
         return ""  # its legend says all
     seeds = sorted({np.shape(curve.runs)[0] for curve in figure.curves})
-    count = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]}–{seeds[-1]}"
-    parts = ["One seed per line."]
+    parts = ["One run per line." if figure.joined else "One run per point."]
     if seeds[-1] > 1:
+        count = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+        centre = statistics.CENTRES[figure.centre][1]
+        band, each = ("Band", "Thin lines") if figure.joined else ("Bars", "Dots")
         parts = [
-            f"Thick: {figure.centre} of {count} seeds; thin: each seed; "
-            f"band: 95 % bootstrap interval of the {figure.centre}."
+            f"{centre.capitalize()} over {count} runs. {band}: its 95 % bootstrap interval. "
+            f"{each}: each run."
         ]
+    names = [curve.label for curve in figure.curves]
+    parts += [f"{' and '.join(names[i] for i in group)} coincide." for group in coinciding(figure)]
     longest = max(np.shape(curve.x)[0] for curve in figure.curves)
     if longest > drawn_points(figure):
         parts.append(f"Up to {drawn_points(figure)} of {longest:,} points are drawn, unsmoothed.")
     return " ".join(parts)
+
+
+def coinciding(figure: Figure) -> list[list[int]]:
+    """Indices of curves that lie on each other: nearly everywhere within half a percent of the
+    figure's height."""
+    drawn = [sampled(c, figure.centre, figure.log_x, drawn_points(figure)) for c in figure.curves]
+    centres = np.concatenate([curve.centre for curve in drawn])
+    levels = [level.value for level in figure.references]
+    present = [*centres[np.isfinite(centres)], *levels] or [0.0]
+    near = 0.005 * (max(present) - min(present))
+    groups: list[list[int]] = []
+    for i, curve in enumerate(drawn):
+        for group in groups:
+            other = drawn[group[0]]
+            inside = (curve.x >= other.x[0]) & (curve.x <= other.x[-1])
+            apart = np.abs(curve.centre - np.interp(curve.x, other.x, other.centre))[inside]
+            if 2 * len(apart) >= len(curve.x) > 1 and np.mean(apart <= near) >= 0.9:
+                group.append(i)
+                break
+        else:
+            groups.append([i])
+    return [group for group in groups if len(group) > 1]
 
 
 def description(figure: Plot) -> str:
@@ -165,6 +146,39 @@ def description(figure: Plot) -> str:
     )
 
 
+def tips(figure: Plot, axes: Axes) -> dict[str, Any] | None:
+    """What a tooltip tells, as JSON can hold it, and where in the picture: `box` is the axes' left,
+    top, width and height as shares of the picture's. None of tracks, beside which is a table."""
+    place = axes.get_position()
+    box = [round(v, 4) for v in (place.x0, 1 - place.y1, place.width, place.height)]
+    if isinstance(figure, HeatMap):
+        values = [[f"{v:.4g}" for v in row] for row in np.asarray(figure.values, np.float64)]
+        rows, columns = (
+            [f"{name} {label}" for label in labels]
+            for name, labels in (
+                (figure.y_label, figure.row_labels),
+                (figure.x_label, figure.column_labels),
+            )
+        )
+        return {"box": box, "rows": rows, "columns": columns, "values": values}
+    if isinstance(figure, Tracks):
+        return None
+    range_ = [float(v) for v in axes.get_xlim()]
+    curves = [curve_tips(curve, figure) for curve in figure.curves]
+    return {"box": box, "x": range_, "log": figure.log_x, "name": figure.x_label, "curves": curves}
+
+
+def curve_tips(curve: Curve, figure: Figure) -> dict[str, Any]:
+    """The values of one curve in words, at some of its points."""
+    shown = sampled(curve, figure.centre, figure.log_x, drawn_points(figure))
+    every = -(-len(shown.x) // MOST_TIPS)
+    texts = []
+    for value, low, high in zip(shown.centre, shown.low, shown.high, strict=True):
+        band = f" [{low:.4g}, {high:.4g}]" if math.isfinite(low) else ""
+        texts.append(f"{value:.4g}{band}".replace("-", "−") if math.isfinite(value) else "")
+    return {"x": [float(f"{x:.6g}") for x in shown.x[::every]], "text": texts[::every]}
+
+
 def inline(svg: str, label: str, prefix: str) -> str:
     """matplotlib's SVG file as an element that can stand in a page beside others."""
     svg = svg[svg.index("<svg") :]
@@ -186,75 +200,121 @@ def compact(tag: str, prefix: str) -> str:
     tag = re.sub(r'\b(id="|xlink:href="#|url\(#)', rf"\g<1>{prefix}", tag)
     tag = tag.replace("xlink:href", "href").replace("base64,\n", "base64,")
     tag = re.sub(r"font-family: [^;\"]*", f"font-family: {FONT}", tag)
-    return re.sub(r'(?<=\bd=")[^"]*', short_path, tag)
+    return re.sub(r"(\.\d)\d+", r"\1", tag) if tag.startswith("<path") else tag
 
 
-def short_path(path: re.Match[str]) -> str:
-    rounded = re.sub(r"-?\d+\.\d+", lambda number: f"{float(number[0]):.1f}", path[0])
-    return re.sub(r"\s*\n\s*|(?<=[A-Za-z]) ", "", rounded.replace(".0", ""))
+# ------------------------------------------------------------------------------------ drawing
 
 
-def draw(figure: Plot, theme: Theme) -> Canvas:
-    """The figure on a canvas of its own, with no title."""
+def draw(figure: Plot, theme: Theme, looks: Looks | None = None, legend: bool = True) -> Canvas:
+    """The figure on a canvas of its own, with no title. Arguments as of `figure_svg`."""
     canvas = Canvas(figsize=(WIDTH, HEIGHT), layout="constrained")
     FigureCanvasAgg(canvas)  # measures text; saving as SVG brings its own
     axes = canvas.add_subplot()
-    axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(theme.muted)
-    axes.tick_params(color=theme.muted, labelcolor=theme.ink, length=3)
+    axes.tick_params(color=theme.muted, labelcolor=theme.ink)
     axes.set_xlabel(textwrap.fill(figure.x_label, 54), color=theme.ink)
     axes.set_ylabel(textwrap.fill(figure.y_label, 34), color=theme.ink)
     if isinstance(figure, HeatMap):
         draw_heat_map(canvas, axes, figure, theme)
-    elif isinstance(figure, Tracks):
-        draw_tracks(canvas, axes, figure, theme)
+        return canvas
+    if isinstance(figure, Tracks):
+        handles = draw_tracks(canvas, axes, figure, theme)
     else:
-        draw_curves(canvas, axes, figure, theme)
+        handles = draw_curves(canvas, axes, figure, theme, looks)
+        legend = legend and any(curve.label.strip() for curve in figure.curves)
+    if legend or isinstance(figure, Tracks):
+        add_legend(canvas, handles, theme)
+    if isinstance(figure, Figure):
+        label_references(canvas, axes, figure.references, theme)
     return canvas
 
 
-def draw_curves(canvas: Canvas, axes: Axes, figure: Figure, theme: Theme) -> None:
-    lines = [
-        draw_curve(axes, index, curve, figure, theme) for index, curve in enumerate(figure.curves)
-    ]
-    axes.grid(axis="y", color=theme.grid, linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.margins(x=0.02)
+def draw_curves(
+    canvas: Canvas, axes: Axes, figure: Figure, theme: Theme, looks: Looks | None
+) -> list[Artist]:
+    """All curves and levels; what stands for the named ones in the legend."""
+    looks = assign(curve.label for curve in figure.curves) if looks is None else looks
+    together = coinciding(figure)
+    lines: list[Artist] = []
+    for i, curve in enumerate(figure.curves):
+        inside = [len(group) - 1 - group.index(i) for group in together if i in group]
+        shift = 3.0 * (i - (len(figure.curves) - 1) / 2)  # points
+        look = Drawing(
+            color=theme.curves[looks[curve.label].color],
+            dashes=DASHES[looks[curve.label].dash],
+            # Of curves that coincide each is drawn inside the one before.
+            width=1.8 + 2.0 * sum(inside),
+            transform=offset_copy(axes.transData, fig=canvas, x=shift, units="points"),
+        )
+        lines.append(draw_curve(axes, i, curve, figure, look))
+    axes.grid(axis="y", color=theme.grid)
+    axes.margins(x=0.02 if figure.joined else 0.06)
+    scale(axes, figure)
+    for line in figure.references:
+        axes.axhline(line.value, color=theme.muted, linewidth=1, dashes=(4, 3), zorder=1.5)
+    named = zip(lines, figure.curves, strict=True)
+    return [line for line, curve in named if curve.label.strip()]
+
+
+def scale(axes: Axes, figure: Figure) -> None:
+    """Ticks that a reader expects, and the range that was asked for."""
+    places = np.unique(np.concatenate([np.asarray(c.x, np.float64) for c in figure.curves]))
     if figure.log_x:
         axes.set_xscale("log")
         axes.xaxis.set_minor_formatter(NullFormatter())
         first, last = axes.get_xlim()
         if last < 300 * first:  # powers of ten alone would be two labels or none
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    elif not figure.joined and len(places) <= 9:
+        axes.set_xticks(places)
+    elif np.all(places == np.round(places)):
+        axes.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=[1, 2, 2.5, 5, 10]))
     if figure.y_range is not None:
         levels = [*figure.y_range, *(line.value for line in figure.references)]
         low, high = min(levels), max(levels)
         axes.set_ylim(low - 0.03 * (high - low), high + 0.03 * (high - low))
-    for line in figure.references:
-        axes.axhline(line.value, color=theme.muted, linewidth=1, dashes=(4, 3), zorder=1.5)
     shorten_ticks(axes.xaxis, always=figure.log_x)
     shorten_ticks(axes.yaxis)
-    named = [line for line, curve in zip(lines, figure.curves, strict=True) if curve.label.strip()]
-    add_legend(canvas, named, theme)
-    label_references(canvas, axes, figure.references, theme)
 
 
-def draw_curve(axes: Axes, index: int, curve: Curve, figure: Figure, theme: Theme) -> Line2D:
-    """Seeds, interval and centre of one curve; the line that stands for it in the legend."""
-    color = theme.curves[index % len(theme.curves)]
-    dashes = DASHES[index % len(DASHES)] if len(figure.curves) > 3 else DASHES[0]
+@dataclass(frozen=True)
+class Drawing:
+    """How one curve is drawn. `transform`: beside the others, where runs are dots."""
+
+    color: str
+    dashes: tuple[float, ...]
+    width: float  # points
+    transform: Any
+
+
+def draw_curve(axes: Axes, index: int, curve: Curve, figure: Figure, look: Drawing) -> Line2D:
+    """Runs, interval and centre of one curve, whose ids begin with `curve-index-`; the line that
+    stands for it in the legend."""
     shown = sampled(curve, figure.centre, figure.log_x, drawn_points(figure))
-    seeds = sum(np.shape(other.runs)[0] for other in figure.curves)
-    marker = {"marker": "o", "markersize": 3.5} if len(shown.x) <= 25 else {}
-    if len(shown.runs) > 1:
-        alpha = 0.35 if seeds <= 20 else 0.2
-        axes.plot(shown.x, shown.runs.T, color=color, linewidth=0.6, alpha=alpha, zorder=2)
-        axes.fill_between(shown.x, shown.low, shown.high, color=color, alpha=0.18, lw=0, zorder=2.5)
+    several = sum(np.shape(other.runs)[0] for other in figure.curves) > 20
+    marker = {"marker": "o", "ms": 2.0 + look.width} if len(shown.x) <= FEW_POINTS else {}
+    artists: list[Artist] = []
+    if len(shown.runs) > 1 and figure.joined:
+        thin: dict[str, Any] = {"lw": 0.6, "alpha": 0.2 if several else 0.35, "zorder": 2}
+        artists += axes.plot(shown.x, shown.runs.T, color=look.color, **thin)
+        band: dict[str, Any] = {"color": look.color, "alpha": 0.18, "lw": 0, "zorder": 2.5}
+        artists.append(axes.fill_between(shown.x, shown.low, shown.high, **band))
+    beside = {} if figure.joined else {"transform": look.transform}
+    if len(shown.runs) > 1 and not figure.joined:
+        dots: dict[str, Any] = {"lw": 0, "marker": "o", "mew": 0, "ms": 3, "alpha": 0.45}
+        artists += axes.plot(shown.x, shown.runs.T, color=look.color, zorder=2, **dots, **beside)
+        bars = {"colors": look.color, "lw": 1.2, "zorder": 2.5}
+        artists.append(axes.vlines(shown.x, shown.low, shown.high, **bars, **beside))
     (line,) = axes.plot(
         *(shown.x, shown.centre),
-        **{"color": color, "linewidth": 1.8, "dashes": dashes, "zorder": 3, **marker},
+        **{"color": look.color, "lw": look.width, "dashes": look.dashes, "zorder": 3, **marker},
+        **({} if figure.joined else {"alpha": 0.9}),
+        **beside,
         label=textwrap.fill(curve.label, 56),
     )
+    for count, artist in enumerate([*artists, line]):
+        artist.set_gid(f"curve-{index}-{count}")
     return line
 
 
@@ -290,9 +350,7 @@ def sampled(curve: Curve, centre: str, log_x: bool, points: int) -> Sampled:
         chosen = np.union1d(chosen, [0, len(x) - 1])
         x, runs = x[chosen], runs[:, chosen]
     runs = np.where(np.isfinite(runs), runs, np.nan)
-    statistic = np.mean if centre == "mean" else np.median
-    low, high = bootstrap_interval(runs, statistic)
-    return Sampled(x, runs, statistic(runs, axis=0), low, high)
+    return Sampled(x, runs, *statistics.centred(runs, centre, RESAMPLES))
 
 
 def shorten_ticks(axis: Axis, always: bool = False) -> None:
@@ -384,6 +442,7 @@ def spread_out(centres: Sequence[float], heights: Sequence[float]) -> list[float
 
 
 def draw_heat_map(canvas: Canvas, axes: Axes, figure: HeatMap, theme: Theme) -> None:
+    """One rectangle a cell, a bar that explains their colours, and labels."""
     values = np.asarray(figure.values, dtype=np.float64)
     values = np.where(np.isfinite(values), values, np.nan)
     height = float(np.clip(0.65 + 0.2 * len(values), 1.65, 5.35))  # inches, of the cells
@@ -404,7 +463,8 @@ def draw_heat_map(canvas: Canvas, axes: Axes, figure: HeatMap, theme: Theme) -> 
     label_cells(canvas, axes, figure, height)
 
 
-def draw_tracks(canvas: Canvas, axes: Axes, figure: Tracks, theme: Theme) -> None:
+def draw_tracks(canvas: Canvas, axes: Axes, figure: Tracks, theme: Theme) -> list[Artist]:
+    """Everybody, the goals and the breaks; what stands for them in the legend."""
     rows, columns = len(figure.row_labels), len(figure.column_labels)
     cell = 3.9 / columns  # inches; about what the axes have
     height = float(np.clip(rows * max(cell, 0.24), 1.3, 4.0))
@@ -439,7 +499,7 @@ def draw_tracks(canvas: Canvas, axes: Axes, figure: Tracks, theme: Theme) -> Non
         label = textwrap.fill(track.label, 56)
         handles.append(Line2D([], [], **look, lw=0, ms=7, mew=0.7, label=label))
     label_cells(canvas, axes, figure, height)
-    add_legend(canvas, handles, theme)
+    return handles
 
 
 def draw_goals(axes: Axes, figure: Tracks, theme: Theme) -> list[Artist]:

@@ -1,0 +1,111 @@
+"""Colours and dashes: of the page, by theme, and of methods, the same on every page."""
+
+import itertools
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+
+STATIC = Path(__file__).parent / "static"
+STYLE: dict[Any, Any] = dict(
+    matplotlib.rc_params_from_file(STATIC / "figure.mplstyle", use_default_template=False)
+)
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours. The curves are those of Okabe & Ito (2008) without the yellow, told apart by the
+    colour-blind; on a dark page the same hues, lighter."""
+
+    ink: str
+    muted: str
+    grid: str
+    page: str
+    box: str  # behind commands and the heads of tables
+    cold: str  # lowest value of a heat map with both signs
+    warm: str  # highest value
+    curves: tuple[str, ...]
+
+
+LIGHT = Theme(
+    ink="#1c1f23",
+    muted="#59616b",
+    grid="#e6e9ec",
+    page="#ffffff",
+    box="#f5f6f8",
+    cold="#005b96",
+    warm="#c24a00",
+    curves=("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#333333"),
+)
+DARK = Theme(
+    ink="#e4e7eb",
+    muted="#a0a8b2",
+    grid="#2b3037",
+    page="#14171b",
+    box="#1d2127",
+    cold="#58b2f0",
+    warm="#f08a4b",
+    curves=("#4aa3e6", "#f07f3c", "#22bd8f", "#e097c2", "#f2b441", "#93d3f7", "#e8e8e8"),
+)
+DASHES = ((1.0, 0.0), (6.0, 1.6), (6.0, 1.5, 1.3, 1.5), (1.3, 1.3))  # in widths of the line
+
+
+class Look(NamedTuple):
+    """Indices of a colour among a theme's `curves`, and of `DASHES`."""
+
+    color: int
+    dash: int
+
+
+# Hybrids and networks that are often compared are solid lines, gradient alone is dashed, evolution
+# alone dashed and dotted. No two methods look the same.
+METHODS = {
+    "merl": Look(0, 0),
+    "erl": Look(1, 0),
+    "mmu": Look(2, 0),
+    "cerl": Look(3, 0),
+    "lstm": Look(4, 0),
+    "dmmu": Look(5, 0),
+    "gru": Look(6, 0),
+    "td3": Look(0, 1),
+    "bptt": Look(1, 1),
+    "matd3": Look(2, 1),
+    "maddpg": Look(3, 1),
+    "sac": Look(4, 1),
+    "ddpg": Look(5, 1),
+    "ppo": Look(6, 1),
+    "rnn": Look(0, 2),
+    "lstmsm": Look(1, 2),
+    "ea": Look(2, 2),
+    "cnf": Look(3, 2),
+    "ccea": Look(4, 2),
+    "neuroevolution": Look(5, 2),
+    "mlp": Look(6, 2),
+}
+ALIASES = {"gradient": "bptt", "evolution": "neuroevolution", "feed": "mlp"}
+
+
+def method(label: str) -> str | None:
+    """The first known method that a label names, in any spelling of case."""
+    words = (ALIASES.get(word, word) for word in re.findall(r"\w+", label.lower()))
+    return next((word for word in words if word in METHODS), None)
+
+
+def assign(labels: Iterable[str]) -> Mapping[str, Look]:
+    """How the curves of a page look: a label that names a method as that method; any other, and a
+    second of the same method, as nothing else on the page. The same labels look the same."""
+    names = list(dict.fromkeys(labels))
+    looks: dict[str, Look] = {}
+    for name in sorted(names, key=lambda name: name.lower() not in METHODS):  # exact ones first
+        known = METHODS.get(method(name) or "")
+        if known is not None and known not in looks.values():
+            looks[name] = known
+    colors, dashes = len(LIGHT.curves), len(DASHES)
+    free = (Look(i % colors, i % dashes) for i in range(colors * dashes))
+    spare = [look for look in free if look not in looks.values()] or [Look(0, 0)]
+    rest = [name for name in names if name not in looks]
+    looks |= dict(zip(rest, itertools.cycle(spare), strict=False))  # more than there are: again
+    return {name: looks[name] for name in names}
