@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from ..types import Sequence, TimeStep
+from .viewer import Viewer
 
 
 class AbstractEnvironment(eqx.Module):
@@ -41,6 +42,16 @@ class AbstractEnvironment(eqx.Module):
     def reported(self) -> str:
         """The reward signal by which a champion is judged."""
         return self.signals[-1]
+
+    @property
+    def unwrapped(self) -> "AbstractEnvironment":
+        """The task itself, within whatever delays its rewards, adds noise or cuts it short."""
+        return self
+
+    def viewer(self) -> Viewer | None:
+        """How a page draws its episodes; None: it does not. A task that draws its state in
+        `render(state) -> [height, width, 3]` can be filmed as well."""
+        return None
 
     @property
     def sizes(self) -> tuple[int, ...]:

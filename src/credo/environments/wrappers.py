@@ -42,6 +42,49 @@ class Shortened(AbstractSequenceTask):
         scored = sequence.scored & (jnp.arange(self.max_steps) < length)
         return Sequence(sequence.inputs, sequence.targets, scored, length)
 
+    @property
+    def unwrapped(self) -> AbstractEnvironment:
+        return self.task.unwrapped
+
+    def lesson(self, sequence):
+        return self.task.lesson(sequence)
+
+    def reward(self, answer, target, scored, perfect):
+        return self.task.reward(answer, target, scored, perfect)
+
+
+class Given(AbstractSequenceTask):
+    """A sequence task of which the sequences are given: `rollout.evaluate` plays each once with
+    every policy. An episode alone draws one of them."""
+
+    task: AbstractSequenceTask  # that says what an answer earns
+    sequences: Sequence  # leaves [n, ...], at least one
+
+    @classmethod
+    def alone(cls, task: AbstractSequenceTask, sequence: Sequence) -> "Given":
+        """This one sequence."""
+        return cls(task, jax.tree.map(lambda x: jnp.asarray(x)[None], sequence))
+
+    @property
+    def n(self) -> int:
+        return self.sequences.inputs.shape[0]
+
+    @property
+    def obs_size(self) -> int:
+        return self.sequences.inputs.shape[2]
+
+    @property
+    def max_steps(self) -> int:
+        return self.sequences.inputs.shape[1]
+
+    @property
+    def unwrapped(self) -> AbstractEnvironment:
+        return self.task.unwrapped
+
+    def sample(self, *, key: PRNGKeyArray) -> Sequence:
+        i = jax.random.randint(key, (), 0, self.n)
+        return jax.tree.map(lambda x: x[i], self.sequences)
+
     def lesson(self, sequence):
         return self.task.lesson(sequence)
 
@@ -77,6 +120,10 @@ class AbstractWrapper(AbstractEnvironment):
     @property
     def reported(self) -> str:
         return self.env.reported
+
+    @property
+    def unwrapped(self) -> AbstractEnvironment:
+        return self.env.unwrapped
 
 
 class NoisyObservations(AbstractWrapper):
@@ -193,6 +240,10 @@ class DelayedHostReward(AbstractHostEnvironment):
     @property
     def reported(self) -> str:
         return self.env.reported
+
+    @property
+    def unwrapped(self) -> AbstractHostEnvironment:
+        return self.env.unwrapped
 
     @property
     def reward_shapes(self) -> dict[str, tuple[int, ...]]:
