@@ -68,9 +68,13 @@ def evaluate(
     """
     if isinstance(env, AbstractHostEnvironment):
         return _play_on_host(env, population, episodes, episodes, common, False, key=key)[0]
-    if isinstance(env, Given) and episodes != env.n:
-        raise ValueError(f"{episodes} episodes of {env.n} given sequences: play each once")
-    if isinstance(env, AbstractSequenceTask) and getattr(population, "features_first", False):
+    packed = getattr(population, "features_first", False)
+    if isinstance(env, Given) and not (packed and episodes == env.n):
+        raise ValueError(
+            f"{env.n} given sequences are played once each by features-first policies: {episodes} "
+            f"episodes were asked for, of {type(population).__name__}"
+        )
+    if isinstance(env, AbstractSequenceTask) and packed:
         return _answer(env, population, episodes, common, key=key)
     lanes = _lanes(population, episodes, common, key=key)
     play = _play_in_turn if tree.batch(population) < tree.size(population) else _play
@@ -313,9 +317,7 @@ def moments(
 def _record_on_host(
     env: AbstractHostEnvironment, policy: AbstractPolicy, *, key: PRNGKeyArray
 ) -> Trace:
-    start, *later = itertools.islice(
-        moments(env.copies(1), policy, key=key), env.max_steps + 1
-    )
+    start, *later = itertools.islice(moments(env.copies(1), policy, key=key), env.max_steps + 1)
     steps = [moment.step for moment in later if moment.step is not None]
     active = None
     if env.agents is not None:

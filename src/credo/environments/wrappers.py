@@ -54,8 +54,8 @@ class Shortened(AbstractSequenceTask):
 
 
 class Given(AbstractSequenceTask):
-    """A sequence task of which the sequences are given: `rollout.evaluate` plays each once with
-    every policy. An episode alone draws one of them."""
+    """A sequence task of which the sequences are given: in `rollout.evaluate` every features-first
+    policy answers each of them once. An episode alone draws one of them."""
 
     task: AbstractSequenceTask  # that says what an answer earns
     sequences: Sequence  # leaves [n, ...], at least one
