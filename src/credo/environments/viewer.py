@@ -10,7 +10,10 @@ from typing import Any, Literal
 
 from ..types import Trace
 
-Shape = Literal["dot", "ring", "square", "line", "dashed", "star", "cross", "diamond", "arrow"]
+Shape = Literal[
+    *("dot", "ring", "square", "box", "diamond", "rhombus", "star", "arrow"),
+    *("line", "dashed", "tick", "cross", "plus", "minus"),
+]
 
 
 @dataclass(frozen=True)

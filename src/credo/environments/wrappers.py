@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
 from .. import require
-from ..types import Sequence, TimeStep
+from ..types import Sequence, TimeStep, Trace
 from .base import AbstractEnvironment, AbstractSequenceTask
 from .host import AbstractCopies, AbstractHostEnvironment, HostStep
+from .viewer import Viewer
 
 
 class Shortened(AbstractSequenceTask):
@@ -125,6 +126,19 @@ class AbstractWrapper(AbstractEnvironment):
     def unwrapped(self) -> AbstractEnvironment:
         return self.env.unwrapped
 
+    def bare(self, state: PyTree) -> PyTree:
+        return self.env.bare(state)
+
+    def viewer(self) -> Viewer | None:
+        """That of the task itself."""
+        inner = self.unwrapped.viewer()
+
+        def episode(trace: Trace):
+            assert inner is not None
+            return inner.episode(dataclasses.replace(trace, states=self.bare(trace.states)))
+
+        return inner and dataclasses.replace(inner, episode=episode)
+
 
 class NoisyObservations(AbstractWrapper):
     """A JAX task whose observations are told with noise N(0, std²), drawn anew for every entry,
@@ -189,6 +203,9 @@ class DelayedReward(AbstractWrapper):
     @property
     def obs_range(self) -> tuple[float, float]:
         return self.env.obs_range
+
+    def bare(self, state: DelayedState) -> PyTree:
+        return self.env.bare(state.inner)
 
     def reset(self, *, key: PRNGKeyArray) -> tuple[DelayedState, TimeStep]:
         inner, first = self.env.reset(key=key)
