@@ -14,8 +14,9 @@ import numpy as np
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.compilation import jit
 from credo.environments.sequence_classification import SequenceClassification
+from credo.environments.wrappers import Given
 from credo.networks.mmu import MMU
-from credo.rollout import play_sequences
+from credo.rollout import evaluate
 
 POPULATION, SEQUENCES, ROUNDS, GOAL, GOAL_STEPS = 100, 10, 15, 8.0, 30e6
 
@@ -62,9 +63,9 @@ def main() -> None:
     task = SequenceClassification(depth=21)
     algorithm = Neuroevolution(task, MMU(hidden=5))
     state = jit(algorithm.init)(key=jax.random.key(0))
-    keys = jax.random.split(jax.random.key(1), (1, SEQUENCES))
-    sequences = jax.vmap(jax.vmap(lambda key: task.sample(key=key)))(keys)
-    play = jit(play_sequences)
+    keys = jax.random.split(jax.random.key(1), SEQUENCES)
+    sequences = jax.vmap(lambda key: task.sample(key=key))(keys)
+    play = jit(lambda given, population: evaluate(given, population, SEQUENCES, key=keys[0]))
     whole = jit(algorithm.generation)
 
     w = {
@@ -72,10 +73,11 @@ def main() -> None:
         for name in vars(state.population)
         if eqx.is_array(getattr(state.population, name))
     }
-    arrays = [np.asarray(a)[0] for a in (sequences.inputs[..., 0], sequences.targets)]
-    arrays += [np.asarray(a)[0] for a in (sequences.scored, sequences.length)]
+    arrays = [np.asarray(a) for a in (sequences.inputs[..., 0], sequences.targets)]
+    arrays += [np.asarray(a) for a in (sequences.scored, sequences.length)]
+    given = Given(task, sequences)
 
-    ours = np.asarray(play(task, state.population, sequences).returns["fitness"])
+    ours = np.asarray(play(given, state.population).returns["fitness"])
     theirs = numpy_fitness(w, *arrays)
     agree = np.mean(np.abs(ours - theirs) < 1e-2 * (1 + np.abs(theirs)))
     jax.block_until_ready(whole(state, key=jax.random.key(2)))
@@ -83,7 +85,7 @@ def main() -> None:
     times = {"credo": [], "generation": [], "numpy": []}
     for _ in range(ROUNDS):
         for name, run in (
-            ("credo", lambda: play(task, state.population, sequences)),
+            ("credo", lambda: play(given, state.population)),
             ("generation", lambda: whole(state, key=jax.random.key(2))),
             ("numpy", lambda: numpy_fitness(w, *arrays)),
         ):

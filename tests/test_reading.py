@@ -8,7 +8,6 @@ import jax
 import pytest
 
 import credo
-from credo import rollout
 from credo.algorithms.erl import ERL
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy
@@ -28,7 +27,6 @@ def called(function) -> dict[pathlib.Path, set[int]]:
             found.setdefault(pathlib.Path(code.co_filename), set()).add(code.co_firstlineno)
 
     jax.clear_caches()  # what was compiled before is not traced again
-    rollout._programs.cache_clear()
     sys.setprofile(look)
     try:
         function()

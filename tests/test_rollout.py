@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compilations import compilations
+from reading import read
 from walk import START, HostWalk, Walk, Walkers
 
 from credo import rollout, tree
@@ -16,7 +17,7 @@ from credo.environments.host import InTurn
 from credo.environments.probes import Copy, Meet, Remember
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
-from credo.environments.wrappers import delayed
+from credo.environments.wrappers import Given, delayed
 from credo.networks.base import AbstractPolicy
 from credo.networks.exploration import Explorer, GaussianNoise
 from credo.networks.mlp import MLP
@@ -83,23 +84,28 @@ def test_the_fast_path_equals_episode_by_episode(env, name, common):
 
 @pytest.fixture(scope="module")
 def sequences():
-    """Sequences of different lengths, `[1, episodes, ...]`."""
+    """Sequences of different lengths, `[episodes, ...]`."""
     keys = jax.random.split(jax.random.key(2), EPISODES)
-    drawn = jax.vmap(lambda key: CLASSIFICATION.sample(key=key))(keys)
-    return jax.tree.map(lambda x: x[None], drawn)
+    return jax.vmap(lambda key: CLASSIFICATION.sample(key=key))(keys)
+
+
+def answers(population, sequences):
+    """What a population earns with these sequences."""
+    env = Given(CLASSIFICATION, sequences)
+    return rollout.evaluate(env, population, EPISODES, key=jax.random.key(0))
 
 
 @pytest.fixture(scope="module")
 def answered(sequences):
     """One compiled way to answer them."""
     population = population_of(CLASSIFICATION, NETWORKS["mmu"])
-    play = eqx.filter_jit(lambda s: rollout.play_sequences(CLASSIFICATION, population, s))
+    play = eqx.filter_jit(lambda s: answers(population, s))
     return play, play(sequences)
 
 
 def test_padding_never_counts(sequences, answered):
     play, expected = answered
-    assert len(set(sequences.length[0].tolist())) > 1
+    assert len(set(sequences.length.tolist())) > 1
     time = jnp.broadcast_to(jnp.arange(CLASSIFICATION.max_steps), sequences.targets.shape)
     padding = time >= sequences.length[..., None]
     assert padding.any()
@@ -114,21 +120,25 @@ def test_padding_never_counts(sequences, answered):
     result = play(dirty)
     assert_same(result, expected)
     np.testing.assert_array_equal(result.returns["fitness"], expected.returns["fitness"])
-    np.testing.assert_array_equal(
-        result.steps, np.broadcast_to(sequences.length[0], (POP, EPISODES))
-    )
+    np.testing.assert_array_equal(result.steps, np.broadcast_to(sequences.length, (POP, EPISODES)))
 
 
 def test_more_padding_changes_nothing(sequences, answered):
     _, expected = answered
     longer = jax.tree.map(
-        lambda x: (
-            jnp.pad(x, [(0, 0)] * 2 + [(0, 6)] + [(0, 0)] * (x.ndim - 3)) if x.ndim > 2 else x
-        ),
+        lambda x: jnp.pad(x, [(0, 0)] + [(0, 6)] + [(0, 0)] * (x.ndim - 2)) if x.ndim > 1 else x,
         sequences,
     )
     population = population_of(CLASSIFICATION, NETWORKS["mmu"])
-    assert_same(rollout.play_sequences(CLASSIFICATION, population, longer), expected)
+    assert_same(answers(population, longer), expected)
+
+
+def test_given_sequences_are_played_once_each(sequences):
+    population = population_of(CLASSIFICATION, NETWORKS["mmu"])
+    env = Given(CLASSIFICATION, jax.tree.map(lambda x: x[:3], sequences))
+    for wrong, members in ((2, population), (3, Slow(population))):
+        with pytest.raises(ValueError, match="3 given sequences are played once each"):
+            rollout.evaluate(env, members, wrong, key=jax.random.key(0))
 
 
 class Constant(AbstractPolicy):
@@ -247,7 +257,7 @@ def test_the_carry_lives_for_one_episode():
     env = Copy(max_steps=3)
     population = tree.stack(Counter(), Counter())
     played = rollout.evaluate(env, population, 2, key=jax.random.key(0))
-    actions, carries = rollout.trace(Counter(), jnp.ones((3, 1)))
+    actions, carries = read(Counter(), jnp.ones((3, 1)))
     assert actions[:, 0].tolist() == pytest.approx([0.0, 0.1, 0.2])
     assert carries.tolist() == [1.0, 2.0, 3.0]
     assert played.steps.tolist() == [[3, 3], [3, 3]]

@@ -1,7 +1,13 @@
-"""Playing episodes: the only place where a policy meets an environment."""
+"""Playing episodes: the only place where a policy meets an environment.
+
+There are two ways in. A population plays for its returns: `evaluate`, and `collect`, which also
+keeps the transitions. One policy is looked at: `record` keeps an episode of it, moment by moment.
+"""
 
 import functools
-from typing import Any
+import itertools
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,9 +18,17 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from . import tree
 from .compilation import float32, jit
 from .environments.base import AbstractEnvironment, AbstractSequenceTask, correct
-from .environments.host import AbstractHostEnvironment, Episodes, sound
+from .environments.host import (
+    AbstractCopies,
+    AbstractHostEnvironment,
+    EnvironmentFailure,
+    Episodes,
+    HostStep,
+    sound,
+)
+from .environments.wrappers import Given
 from .networks.base import AbstractPolicy
-from .types import Evaluation, Sequence, Transition
+from .types import Evaluation, Sequence, Trace, Transition, plain
 
 Environment = AbstractEnvironment | AbstractHostEnvironment
 
@@ -54,7 +68,13 @@ def evaluate(
     """
     if isinstance(env, AbstractHostEnvironment):
         return _play_on_host(env, population, episodes, episodes, common, False, key=key)[0]
-    if isinstance(env, AbstractSequenceTask) and getattr(population, "features_first", False):
+    packed = getattr(population, "features_first", False)
+    if isinstance(env, Given) and not (packed and episodes == env.n):
+        raise ValueError(
+            f"{env.n} given sequences are played once each by features-first policies: {episodes} "
+            f"episodes were asked for, of {type(population).__name__}"
+        )
+    if isinstance(env, AbstractSequenceTask) and packed:
         return _answer(env, population, episodes, common, key=key)
     lanes = _lanes(population, episodes, common, key=key)
     play = _play_in_turn if tree.batch(population) < tree.size(population) else _play
@@ -81,6 +101,24 @@ def collect(
     if isinstance(env, AbstractHostEnvironment):
         return _play_on_host(env, population, episodes, wanted, common, True, key=key)
     return _play(env, _lanes(population, episodes, common, key=key), jnp.int32(wanted), True)
+
+
+@float32()
+def record(
+    env: Environment, policy: AbstractPolicy, *, key: PRNGKeyArray, padded: bool = False
+) -> Trace:
+    """The episode that `evaluate(env, tree.stack(policy), 1, key=key)` plays, moment by moment.
+
+    **Arguments:** `padded`, for use under `jit` and `vmap`: the arrays of a task in JAX have room
+    for `max_steps` steps; what stands behind `length` means nothing. Otherwise they end there, in
+    NumPy.
+
+    **Raises:** `EnvironmentFailure` if the episode of a task outside JAX failed.
+    """
+    if isinstance(env, AbstractHostEnvironment):
+        return _record_on_host(env, policy, key=key)
+    trace = _record(env, policy, key=key)
+    return trace if padded else trace.cut()
 
 
 def score(
@@ -126,11 +164,13 @@ def _answer(
     env: AbstractSequenceTask, population: PyTree, episodes: int, common: bool, *, key: PRNGKeyArray
 ) -> Evaluation:
     """Sequences are known before anybody acts: they are drawn first and answered together."""
+    if isinstance(env, Given):
+        return _answer_these(env, population, jax.tree.map(lambda x: x[None], env.sequences))
     world_key, _ = jax.random.split(key)
     keys = world_keys(1 if common else tree.size(population), episodes, common, key=world_key)
     # An episode resets with the first half of its world key: the same sequences either way.
     sequences = _each(lambda key: env.sample(key=jax.random.split(key)[0]))(keys)
-    return play_sequences(env, population, sequences)
+    return _answer_these(env, population, sequences)
 
 
 @jit
@@ -210,6 +250,92 @@ def _over(lanes: Any, x: Any) -> Any:
     return lanes.reshape(lanes.shape + (1,) * (x.ndim - lanes.ndim))
 
 
+@jit
+def _record(env: AbstractEnvironment, policy: AbstractPolicy, *, key: PRNGKeyArray) -> Trace:
+    world_key, policy_key = jax.random.split(key)
+    reset_key, step_key = jax.random.split(world_keys(1, 1, True, key=world_key)[0, 0])
+    state, first = env.reset(key=reset_key)
+    carry = policy.start(key=jax.random.split(policy_key, (1, 1))[0, 0])
+
+    def advance(loop, t):
+        state, obs, carry = loop
+        action, carry = policy(obs, carry)
+        action = jnp.clip(jnp.where(jnp.isfinite(action), action, 0.0), -1.0, 1.0)
+        state, now = env.step(state, action, key=jax.random.fold_in(step_key, t))
+        seen = (now.obs, state, now.active, carry)
+        return (state, now.obs, carry), (seen, action, now.rewards, now.terminated, now.truncated)
+
+    _, (later, actions, rewards, *ends) = jax.lax.scan(
+        advance, (state, first.obs, carry), jnp.arange(env.max_steps)
+    )
+    start = (first.obs, state, first.active, carry)
+    seen = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), start, later)
+    over = ends[0] | ends[1]
+    last = jnp.where(jnp.any(over), jnp.argmax(over), env.max_steps - 1)
+    return Trace(*seen, actions, rewards, ends[0][last], ends[1][last], last + 1)
+
+
+class Moment(NamedTuple):
+    """A policy and one copy of a task outside JAX, before its next step."""
+
+    obs: np.ndarray
+    active: np.ndarray | None  # of a team: who acts now
+    carry: PyTree
+    action: np.ndarray | None = None  # that led here; None: it is the start
+    step: HostStep | None = None
+
+
+def moments(
+    copies: AbstractCopies, policy: AbstractPolicy, seed: int | None = None, *, key: PRNGKeyArray
+) -> Iterator[Moment]:
+    """What `record` keeps of a task outside JAX, while it happens: for films.
+
+    **Arguments:** `copies`: one; `seed` of its reset: None: the one that `key` draws.
+
+    **Raises:** `EnvironmentFailure` if the episode fails.
+    """
+    form, arrays = _apart(tree.stack(policy))
+    drawn, carry = _start_on_host(form, arrays, (1, 1), True, key)
+    everyone = np.ones(1, bool)
+    seed = np.asarray(drawn).item() if seed is None else seed
+    obs, active, now = copies.reset(np.array([seed], np.uint32), everyone), None, None
+    failed, action = copies.failed, None
+    while True:
+        if failed is not None and failed[0]:
+            raise EnvironmentFailure(copies.failure_text(0))
+        one = jax.tree.map(lambda x: x[0, 0], carry)
+        yield Moment(obs[0], None if active is None else active[0], one, action, now)
+        if now is not None and (now.terminated[0] or now.truncated[0]):
+            return
+        said, carry = _act_on_host(form, arrays, obs, carry)
+        said = np.asarray(said)
+        played = np.clip(np.where(np.isfinite(said), said, np.float32(0.0)), -1.0, 1.0)
+        now = copies.step(played, everyone)
+        obs, active, failed, action = now.obs, now.active, now.failed, played[0]
+
+
+def _record_on_host(
+    env: AbstractHostEnvironment, policy: AbstractPolicy, *, key: PRNGKeyArray
+) -> Trace:
+    start, *later = itertools.islice(moments(env.copies(1), policy, key=key), env.max_steps + 1)
+    steps = [moment.step for moment in later if moment.step is not None]
+    active = None
+    if env.agents is not None:
+        active = np.stack([np.ones(env.agents, bool), *(m.active for m in later)])
+    seen = [start, *later]
+    return Trace(
+        np.stack([m.obs for m in seen]),
+        None,
+        active,
+        jax.tree.map(lambda *xs: plain(jnp.stack(xs)), *(m.carry for m in seen)),
+        np.stack([m.action for m in later]),
+        {name: np.stack([now.rewards[name][0] for now in steps]) for name in env.signals},
+        steps[-1].terminated[0],
+        steps[-1].truncated[0] | ~steps[-1].terminated[0],
+        np.int32(len(steps)),
+    )
+
+
 def _play_on_host(
     env: AbstractHostEnvironment,
     population: PyTree,
@@ -223,15 +349,13 @@ def _play_on_host(
     """The same with copies outside JAX: actions go there and time steps come back, once per step
     for all lanes together."""
     pop = tree.size(population)
-    leaves, structure = jax.tree.flatten(population)
-    arrays = [x if eqx.is_array(x) else None for x in leaves]
-    start, act = _programs(structure, tuple(None if eqx.is_array(x) else x for x in leaves))
-    seeds, first = start(arrays, (pop, episodes), common, key)
+    form, arrays = _apart(population)
+    seeds, first = _start_on_host(form, arrays, (pop, episodes), common, key)
     told = Episodes(env, pop * episodes, record)
     for turn in env.turns(np.tile(np.arange(episodes) < int(wanted), pop)):
         obs, carry = told.begin(np.asarray(seeds).reshape(-1), turn), first
         while told.ongoing:
-            action, carry = act(arrays, obs, carry)
+            action, carry = _act_on_host(form, arrays, obs, carry)
             obs = told.advance(np.asarray(action))
     sums = jax.tree.map(
         lambda x: jnp.asarray(x.reshape(pop, episodes, *x.shape[1:])), (told.returns(), told.steps)
@@ -241,28 +365,50 @@ def _play_on_host(
     return Evaluation(*sums), Experience(Transition(*told.rows()), None)
 
 
-@functools.lru_cache(maxsize=64)
-def _programs(structure, rest: tuple):
-    """Compiled start and action of a population of this structure. `equinox.filter_jit` would
-    look at every leaf anew at every step, which takes longer than the step."""
+class _Form:
+    """A population without its arrays: what a program is compiled for. Hashed once, since
+    `equinox.filter_jit` would look at every leaf anew at every step, which takes longer than the
+    step."""
 
-    def policies(arrays):
-        leaves = [x if y is None else y for x, y in zip(arrays, rest, strict=True)]
-        return jax.tree.unflatten(structure, leaves)
+    def __init__(self, structure: Any, rest: tuple[Any, ...]):
+        self.structure, self.rest = structure, rest
+        self.hash = hash((structure, rest))
 
-    def start(arrays, shape, common, key):
-        world_key, policy_key = jax.random.split(key)
-        pop, episodes = shape
-        seeds = _each(jax.random.bits)(world_keys(pop, episodes, common, key=world_key))
-        return seeds, _start(policies(arrays), jax.random.split(policy_key, shape))
+    def __hash__(self) -> int:
+        return self.hash
 
-    def act(arrays, obs, carry):
-        pop = next(x.shape[0] for x in arrays if x is not None)
-        obs = obs.reshape(pop, -1, *obs.shape[1:]).astype(jnp.float32)
-        actions, carry = _act(policies(arrays), obs, carry)
-        return actions.reshape(-1, *actions.shape[2:]), carry
+    def __eq__(self, other: object) -> bool:
+        same = isinstance(other, _Form) and self.structure == other.structure
+        return self is other or (same and self.rest == other.rest)
 
-    return jax.jit(start, static_argnums=(1, 2)), jax.jit(act)
+    def filled(self, arrays: list[Array | None]) -> PyTree:
+        """The population again."""
+        leaves = [x if y is None else y for x, y in zip(arrays, self.rest, strict=True)]
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+def _apart(population: PyTree) -> tuple[_Form, list[Array | None]]:
+    """A population as its form and its arrays."""
+    leaves, structure = jax.tree.flatten(population)
+    arrays = [x if eqx.is_array(x) else None for x in leaves]
+    return _Form(structure, tuple(None if eqx.is_array(x) else x for x in leaves)), arrays
+
+
+@functools.partial(jax.jit, static_argnums=(0, 2, 3))
+def _start_on_host(form: _Form, arrays, shape: tuple[int, int], common: bool, key: PRNGKeyArray):
+    """Seeds of the worlds, and the carries of all lanes `shape`."""
+    world_key, policy_key = jax.random.split(key)
+    seeds = _each(jax.random.bits)(world_keys(*shape, common, key=world_key))
+    return seeds, _start(form.filled(arrays), jax.random.split(policy_key, shape))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _act_on_host(form: _Form, arrays, obs: Array, carry: PyTree):
+    """Actions, one lane behind the other, and carries."""
+    pop = next(x.shape[0] for x in arrays if x is not None)
+    obs = obs.reshape(pop, -1, *obs.shape[1:]).astype(jnp.float32)
+    actions, carry = _act(form.filled(arrays), obs, carry)
+    return actions.reshape(-1, *actions.shape[2:]), carry
 
 
 def _each(function):
@@ -284,7 +430,7 @@ def _act(population: PyTree, obs: Float[Array, "pop episodes obs"], carries: PyT
     )(population, obs, carries)
 
 
-def play_sequences(
+def _answer_these(
     task: AbstractSequenceTask, population: PyTree, sequences: Sequence
 ) -> Evaluation:
     """Answer labelled sequences with a population of features-first policies.
@@ -333,17 +479,3 @@ def pack(population: PyTree) -> PyTree:
     return jax.tree.map(
         lambda x: jnp.moveaxis(x, 0, -1)[..., None, :] if eqx.is_array(x) else x, population
     )
-
-
-@jit
-def trace(policy: AbstractPolicy, inputs: Float[Array, "time in"]):
-    """Feed inputs to one policy and keep everything.
-
-    **Returns:** actions `[time, act]` and the carry after each step, leaves `[time, ...]`.
-    """
-
-    def body(carry, x):
-        action, carry = policy(x, carry)
-        return carry, (action, carry)
-
-    return jax.lax.scan(body, policy.start(key=jax.random.key(0)), inputs)[1]

@@ -1,9 +1,12 @@
 """The records that cross module borders. Every one is a pytree."""
 
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 Metrics = dict[str, Array]  # one scalar per name
 NOTHING = float(np.finfo(np.float32).min)
@@ -85,3 +88,40 @@ class Batch(eqx.Module):
     terminated: Bool[Array, " batch"]
     truncated: Bool[Array, " batch"]
     active: Bool[Array, "batch agents"] | None = None
+
+
+class Trace(eqx.Module):
+    """One episode of one policy, as `credo.rollout.record` keeps it: what viewers, films and the
+    probes of `credo.analysis` take.
+
+    Moments are counted from 0, the start, to `length`; step t leads from moment t to t + 1.
+    """
+
+    observations: Float[Array, "moments *agents obs"]
+    states: PyTree  # of a task in JAX, leaves [moments, ...]; None: the task is outside JAX
+    active: Bool[Array, "moments agents"] | None  # who acts in the step to come; None: no team
+    carries: PyTree  # the policy's memory, leaves [moments, ...]
+    actions: Float[Array, "steps *agents act"]  # as they were played: finite, in [-1, 1]
+    rewards: dict[str, Float[Array, "steps *agents"]]
+    terminated: Bool[Array, ""]  # the task ended the episode
+    truncated: Bool[Array, ""]  # the clock did
+    length: Int[Array, ""]  # steps
+
+    def cut(self) -> "Trace":
+        """Without padding, in NumPy."""
+        steps = int(self.length)
+
+        def until(last: int, part: Any) -> Any:
+            return jax.tree.map(lambda x: plain(x)[:last], part)
+
+        seen = (self.observations, self.states, self.active, self.carries)
+        done = (self.actions, self.rewards)
+        ends = map(np.asarray, (self.terminated, self.truncated, self.length))
+        return Trace(*until(steps + 1, seen), *until(steps, done), *ends)
+
+
+def plain(x: Array) -> np.ndarray:
+    """An array in NumPy; of random keys their bits."""
+    if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+        x = jax.random.key_data(x)
+    return np.asarray(x)

@@ -10,6 +10,7 @@ import numpy as np
 import optax
 import pytest
 from compilations import compilations
+from reading import read
 
 from credo import rollout, tree
 from credo.algorithms.bptt import BPTT, descend, kaiming, loss_of, respond
@@ -38,7 +39,7 @@ def network(task, net=None):
 
 def answers_one_by_one(policy, inputs):
     """`rollout.trace`, sequence by sequence."""
-    return jnp.stack([rollout.trace(policy, x)[0][:, 0] for x in inputs])
+    return jnp.stack([read(policy, x)[0][:, 0] for x in inputs])
 
 
 def gradient(policy, bptt, batch):
@@ -69,7 +70,7 @@ def test_the_gradient_is_that_of_a_plain_scan_and_of_finite_differences(name):
     targets, asked = jax.vmap(task.lesson)(batch)
 
     def plain(policy):
-        answers = jax.vmap(lambda x: rollout.trace(policy, x)[0][:, 0])(batch.inputs)
+        answers = jax.vmap(lambda x: read(policy, x)[0][:, 0])(batch.inputs)
         return jnp.sum(asked * optax.huber_loss(0.5 * answers, 0.5 * targets)) / jnp.sum(asked)
 
     ours = gradient(policy, bptt, batch)

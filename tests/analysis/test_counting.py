@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reading import read
 
 from credo import tree
 from credo.analysis import counting
@@ -12,7 +13,6 @@ from credo.analysis.memory import Masked, memory_of
 from credo.environments.base import correct
 from credo.environments.sequence_classification import SequenceClassification
 from credo.networks.mmu import MMU
-from credo.rollout import trace
 
 LIMIT = 7
 
@@ -142,7 +142,7 @@ def test_a_stream_equals_the_trace_of_the_laid_out_sequence(ties):
         sequence = task.lay_out(signals[:, k], jnp.roll(gaps, 1))
         at = np.flatnonzero(sequence.scored)
         for p in range(3):
-            answers, carry = trace(tree.take(population, p), sequence.inputs)
+            answers, carry = read(tree.take(population, p), sequence.inputs)
             memory = memory_of(carry)[at][checkpoints - 1]
             np.testing.assert_allclose(kept.memory[:, p, k], memory, rtol=1e-3, atol=1e-3)
             right = np.asarray(correct(answers[:, 0], sequence.targets))[at]

@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reading import read
 
 from credo.analysis import memory
 from credo.analysis.counting import exact_counter
 from credo.environments.sequence_classification import SequenceClassification
 from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
-from credo.rollout import trace
 
 TASK = SequenceClassification(depth=3)
 
@@ -114,7 +114,7 @@ def test_a_masked_cell_is_held_before_every_step(policy):
     keep = jnp.array([False, True, True, True])
     masked = memory.Masked(policy, keep, jnp.full(4, 7.0))
     assert memory.memory_of(masked.start(key=jax.random.key(0))).tolist() == [7, -32, -0.5, 0]
-    _, carry = trace(masked, jnp.array([[1.0], [0.0], [-1.0]]))
+    _, carry = read(masked, jnp.array([[1.0], [0.0], [-1.0]]))
     np.testing.assert_array_equal(memory.memory_of(carry)[:, 0], 7.0)
     assert memory.memory_of(carry)[-1, 1] == -33
 
@@ -203,7 +203,7 @@ def test_pseudo_algorithm_of_an_integrator(policy):
 def test_an_lstm_is_probed_through_its_cells():
     lstm = Recurrent("lstm", hidden=2).init(1, 1, key=jax.random.key(0))
     inputs = jnp.array([1.0, 0.0, -1.0])[:, None]
-    _, (_, cells) = trace(lstm, inputs)
+    _, (_, cells) = read(lstm, inputs)
     np.testing.assert_allclose(jnp.cumsum(memory.writes(lstm, inputs), axis=0), cells, rtol=1e-5)
 
 

@@ -11,6 +11,7 @@ import credo.environments.gymnasium as adapter
 from credo import rollout, tree
 from credo.environments.probes import Meet
 from credo.environments.sequence_classification import SequenceClassification
+from credo.environments.wrappers import Given
 from credo.networks.mmu import MMU
 
 TASKS = {
@@ -110,7 +111,7 @@ def test_gymnasium_imports_the_module_itself():
 
 
 def test_an_episode_earns_what_a_rollout_of_the_same_sequence_does():
-    """A policy plays through Gymnasium, and the same sequence in `play_sequences`."""
+    """A policy plays through Gymnasium, and the same sequence in `evaluate`."""
     task = SequenceClassification(depth=3, min_gap=1, max_gap=3)
     env = adapter.GymnasiumEnvironment(task)
     policy = MMU(hidden=3).init(1, 1, key=jax.random.key(1))
@@ -128,8 +129,8 @@ def test_an_episode_earns_what_a_rollout_of_the_same_sequence_does():
         reset_key = jax.random.split(jax.random.key(episode))[0]
         sequence = task.sample(key=reset_key)
         np.testing.assert_array_equal(seen[:-1], sequence.inputs[: len(rewards)])
-        batch = jax.tree.map(lambda x: x[None, None], sequence)
-        evaluation = rollout.play_sequences(task, tree.stack(policy), batch)
+        same = Given.alone(task, sequence)
+        evaluation = rollout.evaluate(same, tree.stack(policy), 1, key=jax.random.key(0))
         for name, returns in evaluation.returns.items():
             total = sum(float(every[name]) for _, every in rewards)
             assert total == pytest.approx(float(returns[0, 0]), rel=1e-5, abs=1e-6)

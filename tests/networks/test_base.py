@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reading import read
 
 from credo import rollout, tree
 from credo.networks.base import ACTIVATIONS, draw, matvec, to_action
@@ -47,7 +48,7 @@ def test_packed_population_equals_one_by_one(name):
     assert together.shape == (steps, 2, lanes, pop)
     for member in range(pop):
         for lane in range(lanes):
-            alone, _ = rollout.trace(tree.take(population, member), inputs[:, :, lane, member])
+            alone, _ = read(tree.take(population, member), inputs[:, :, lane, member])
             np.testing.assert_allclose(together[:, :, lane, member], alone, atol=1e-5)
 
 
@@ -55,7 +56,7 @@ def test_packed_population_equals_one_by_one(name):
 def test_gradients_through_time_are_finite_and_reach_every_matrix(name):
     policy = NETWORKS[name].init(2, 1, key=jax.random.key(0))
     inputs = jax.random.normal(jax.random.key(1), (20, 2))
-    loss = eqx.filter_jit(eqx.filter_grad(lambda p: jnp.sum(rollout.trace(p, inputs)[0] ** 2)))
+    loss = eqx.filter_jit(eqx.filter_grad(lambda p: jnp.sum(read(p, inputs)[0] ** 2)))
     for path, gradient in jax.tree.leaves_with_path(loss(policy)):
         assert np.isfinite(gradient).all(), jax.tree_util.keystr(path)
         assert np.abs(gradient).max() > 1e-7, jax.tree_util.keystr(path)

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reading import read
 
-from credo import rollout
 from credo.networks.mlp import MLP, MLPPolicy
 from credo.networks.mmu import MMU, MMUPolicy
 from credo.networks.recurrent import Recurrent, RecurrentPolicy
@@ -127,7 +127,7 @@ def test_mmu_follows_the_equations(name):
         x, y, net.hidden, net.memory or net.hidden, net.encoder, net.decoder, net.start_memory
     )
     w, inputs = weights_of(shapes), inputs_of(x)
-    actions, (outputs, memories) = rollout.trace(
+    actions, (outputs, memories) = read(
         MMUPolicy(config=net, **on_device(w)), jnp.asarray(inputs, jnp.float32)
     )
     expected, expected_memories = mmu_by_hand(net, w, inputs)
@@ -210,9 +210,7 @@ def test_recurrent_cells_follow_the_equations(cell, output):
         hidden, state = step(w, row, state)
         out = BY_HAND[output](plus(times(w["Z_y"], hidden), w["b_y"]))
         expected.append(as_action(out, output))
-    actions, carries = rollout.trace(
-        RecurrentPolicy(on_device(w), net), jnp.asarray(inputs, jnp.float32)
-    )
+    actions, carries = read(RecurrentPolicy(on_device(w), net), jnp.asarray(inputs, jnp.float32))
     np.testing.assert_allclose(actions, expected, atol=1e-5)
     last = jax.tree.map(lambda c: c[-1], carries)
     np.testing.assert_allclose(np.array(last), np.array(state), atol=1e-5)
@@ -238,6 +236,6 @@ def test_mlp_follows_the_equations(depth, activation):
             values = plus(times(w[f"W_{layer}"], values), w[f"b_{layer}"])
             values = BY_HAND["tanh" if layer == depth else activation](values)
         expected.append(values)
-    actions, carries = rollout.trace(MLPPolicy(on_device(w), net), jnp.asarray(inputs, jnp.float32))
+    actions, carries = read(MLPPolicy(on_device(w), net), jnp.asarray(inputs, jnp.float32))
     np.testing.assert_allclose(actions, expected, atol=1e-5)
     assert jax.tree.leaves(carries) == []

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reading import read
 
-from credo import rollout
 from credo.networks.base import AbstractPolicy
 from credo.networks.exploration import Explorer, GaussianNoise, OrnsteinUhlenbeck
 from credo.networks.mlp import MLP
@@ -109,9 +109,7 @@ def test_the_policy_inside_keeps_its_carry():
     inner = MLP(hidden=(2,)).init(1, 1, key=jax.random.key(0))
     explorer = Explorer(inner, GaussianNoise(0.0), jnp.bool_(False), 1)
     inputs = jnp.array([[0.1], [0.5], [-0.9]])
-    np.testing.assert_allclose(
-        rollout.trace(explorer, inputs)[0], rollout.trace(inner, inputs)[0], atol=1e-6
-    )
+    np.testing.assert_allclose(read(explorer, inputs)[0], read(inner, inputs)[0], atol=1e-6)
 
 
 @pytest.mark.parametrize(

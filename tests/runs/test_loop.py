@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
+from reading import read
 
-from credo import rollout
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.sequence_classification import SequenceClassification
 from credo.networks.mmu import MMU
@@ -437,7 +437,7 @@ def test_a_signal_saves_and_says_how_to_go_on(tmp_path, number, code):
 def test_a_policy_plays_numpy_observations_like_a_rollout(straight):
     run = loop.Run(straight)
     inputs = np.array([[1.0], [0.0], [-1.0], [0.0], [0.0]], np.float32)
-    actions, _ = rollout.trace(run.champion, jnp.asarray(inputs))
+    actions, _ = read(run.champion, jnp.asarray(inputs))
     policy = run.policy()
     for _ in range(2):  # and the same after a reset
         policy.reset()

@@ -21,6 +21,7 @@ from ..compilation import jit
 from ..environments.server_fleet import ACTS, AWAY, FleetState, ServerFleet, span
 from ..networks.base import AbstractPolicy
 from ..networks.dmmu import DMMUPolicy
+from ..rollout import record
 from .statistics import mean_and_standard_error
 
 HISTORIES = 2_000_000  # joint choices that the exact search may look at
@@ -230,24 +231,25 @@ def trace_fleet(
     env: ServerFleet, policy: DMMUPolicy, genuine: Bool[Array, " devices"], *, key: PRNGKeyArray
 ) -> FleetTrace:
     """One episode with these classes."""
-    return _trace_fleet(env, policy, jnp.asarray(genuine), key)
-
-
-# Playing
+    env = dataclasses.replace(env, classes=tuple(np.asarray(genuine).tolist()))
+    played = record(env, policy, key=key, padded=True)  # no episode ends early
+    before = (played.observations[:-1], jax.tree.map(lambda x: x[:-1], played.carries))
+    return FleetTrace(
+        played.rewards["net"],
+        jnp.asarray(played.active)[:-1],
+        jnp.argmax(played.actions, axis=2),
+        _writes(policy, *before),
+        played.carries.memory[1:],
+    )
 
 
 @jit
-def _trace_fleet(env: ServerFleet, policy: DMMUPolicy, genuine, key: PRNGKeyArray) -> FleetTrace:
-    def advance(loop, step):
-        state, now, carry = loop
-        action, carry, writes = policy.access(now.obs, carry)
-        acting = now.active
-        state, now = env.step(state, action, key=jax.random.fold_in(key, step))
-        seen = (now.rewards["net"], acting, jnp.argmax(action, axis=1), writes, carry.memory)
-        return (state, now, carry), seen
+def _writes(policy: DMMUPolicy, obs: Float[Array, "steps servers obs"], carries: PyTree):
+    """What each server added to the memory in each step."""
+    return jax.vmap(policy.access)(obs, carries)[2]
 
-    start = (*env.begin(genuine), policy.start(key=key))
-    return FleetTrace(*jax.lax.scan(advance, start, jnp.arange(env.max_steps))[1])
+
+# Playing
 
 
 def _action(device: Int[Array, " servers"], devices: int) -> Float[Array, "servers devices"]:

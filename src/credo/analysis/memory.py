@@ -18,25 +18,35 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from ..compilation import jit
 from ..environments.base import correct
 from ..environments.sequence_classification import SequenceClassification
+from ..environments.wrappers import Given
 from ..networks.base import AbstractPolicy
-from ..rollout import trace
+from ..networks.dmmu import DMMUCarry
+from ..rollout import record
 from ..types import Sequence
 
 EXHAUSTIVE = 8
 """Up to so many cells all subsets are tried (256); beyond, cells are dropped one by one."""
 
 
-def memory_of(carry: Any) -> Float[Array, "cells *batch"]:
-    """The memory in a carry: the second of a pair, or the carry itself if it is one array."""
+def known_memory(carry: Any) -> Any:
+    """The memory in a carry: what a DMMU's agents share, the second of a pair, or the carry itself
+    if it is one array; None: no memory is known in it."""
+    if isinstance(carry, DMMUCarry):
+        return carry.memory
     if isinstance(carry, tuple):
-        if len(carry) == 2:
-            return carry[1]
-    elif eqx.is_array(carry):
-        return carry
-    raise TypeError(
-        f"no memory is known in a carry {jax.tree.structure(carry)}: it must be a pair "
-        "(output, memory), as an MMU's, or one array"
-    )
+        return carry[1] if len(carry) == 2 and eqx.is_array_like(carry[1]) else None
+    return carry if eqx.is_array(carry) or isinstance(carry, np.ndarray) else None
+
+
+def memory_of(carry: Any) -> Float[Array, "cells *batch"]:
+    """`known_memory`. Raises `TypeError` if there is none."""
+    memory = known_memory(carry)
+    if memory is None:
+        raise TypeError(
+            f"no memory is known in a carry {jax.tree.structure(carry)}: it must be a pair "
+            "(output, memory), as an MMU's, or one array"
+        )
+    return memory
 
 
 def permutations(depth: int) -> Float[np.ndarray, "n depth"]:
@@ -176,8 +186,15 @@ def _masked_success(policy, sequences: Sequence, keep, held) -> Float[Array, " m
 @jit
 def _recall(policy, inputs: Float[Array, "n time in"]):
     """Answers `[n, time]` and the memory after each step `[n, time, cells]`."""
-    actions, carries = jax.vmap(lambda x: trace(policy, x))(inputs)
-    return actions[..., 0], memory_of(carries)
+
+    def one(x):
+        nothing = jnp.zeros(len(x))
+        sequence = Sequence(x, nothing, nothing > 0, jnp.int32(len(x)))
+        task = Given.alone(SequenceClassification(), sequence)
+        played = record(task, policy, key=jax.random.key(0), padded=True)
+        return played.actions[:, 0], memory_of(played.carries)[1:]
+
+    return jax.vmap(one)(inputs)
 
 
 def signature(

@@ -2,13 +2,15 @@
 
 import abc
 import math
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from ..types import Sequence, TimeStep
+from ..types import Sequence, TimeStep, Trace
+from .viewer import Mark, Viewer
 
 
 class AbstractEnvironment(eqx.Module):
@@ -43,6 +45,20 @@ class AbstractEnvironment(eqx.Module):
         return self.signals[-1]
 
     @property
+    def unwrapped(self) -> "AbstractEnvironment":
+        """The task itself, within whatever delays its rewards, adds noise or cuts it short."""
+        return self
+
+    def bare(self, state: PyTree) -> PyTree:
+        """Of a state of this task that of `unwrapped`."""
+        return state
+
+    def viewer(self) -> Viewer | None:
+        """How a page draws its episodes; None: it does not. A task that draws its state in
+        `render(state) -> [height, width, 3]` can be filmed as well."""
+        return None
+
+    @property
     def sizes(self) -> tuple[int, ...]:
         """Numbers in an observation and in an action, and of a team how many agents: what networks
         and learners are made for."""
@@ -58,6 +74,16 @@ class AbstractEnvironment(eqx.Module):
         self, state: PyTree, action: Float[Array, "*agents act"], *, key: PRNGKeyArray
     ) -> tuple[PyTree, TimeStep]:
         """One transition. After the end (terminated or truncated) its result is ignored."""
+
+
+SEQUENCE_MARKS = (
+    Mark("square", "c0", "an input: up is positive, down negative; faint: to be read"),
+    Mark("line", "ink", "the answer, from −1 to 1"),
+    Mark("square", "good", "pale: the side on which an answer is right; stronger where it counts"),
+    Mark("dot", "good", "an answer that counts and is right (✓ in the whole sequence)"),
+    Mark("dot", "bad", "one that is wrong (× in the whole sequence)"),
+    Mark("line", "muted", "now; in the whole sequence also what is shown above"),
+)
 
 
 class SequenceState(eqx.Module):
@@ -77,6 +103,8 @@ class AbstractSequenceTask(AbstractEnvironment):
 
     action_size: ClassVar[int] = 1
     signals: ClassVar[tuple[str, ...]] = ("fitness", "accuracy", "success")
+    inputs: ClassVar[tuple[str, ...]] = ()
+    """Names of the entries of an observation, for viewers; (): they have none."""
 
     @abc.abstractmethod
     def sample(self, *, key: PRNGKeyArray) -> Sequence:
@@ -103,6 +131,31 @@ class AbstractSequenceTask(AbstractEnvironment):
         sequence = self.sample(key=key)
         state = SequenceState(sequence, jnp.int32(0), jnp.bool_(True))
         return state, _time_step(state, {name: jnp.float32(0.0) for name in self.signals})
+
+    def viewer(self) -> Viewer:
+        """Inputs, answers, and which of them were right."""
+        return Viewer(
+            "sequence",
+            f"{type(self.unwrapped).__name__}: read a sequence and answer at each step; some "
+            "answers count.",
+            self._shown,
+            {"inputs": self.inputs or [f"input {i + 1}" for i in range(self.obs_size)]},
+            SEQUENCE_MARKS,
+            speed=10.0,
+        )
+
+    def _shown(self, trace: Trace) -> dict[str, Any]:
+        """In every step: what is read, the answer, the side that is right, whether it is `scored`
+        and whether it was `right`."""
+        sequence, n = trace.states.sequence, int(trace.length)
+        target, answer = sequence.targets[0, :n], trace.actions[:, 0]
+        return {
+            "inputs": trace.observations[:n],
+            "answer": answer,
+            "target": np.sign(target).astype(int),
+            "scored": sequence.scored[0, :n],
+            "right": np.asarray(correct(answer, target)),
+        }
 
     def step(
         self, state: SequenceState, action: Float[Array, " 1"], *, key: PRNGKeyArray

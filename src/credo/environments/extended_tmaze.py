@@ -15,19 +15,22 @@ one path (`presence`) and whether its *own* endpoint had the reward even where t
 direction of a randomly exploring robot once and keeps them; here every evaluation draws them.
 """
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .. import require
-from ..types import TimeStep
+from ..types import TimeStep, Trace
 from .base import AbstractEnvironment
+from .viewer import Mark, Viewer
 
 SAME_PATH = 0.1  # as coded: the bonus of a trial in which all robots took one path, over T
 EXPLORING = 0.05  # as coded: the bonus of a trial with a new path, over T - 1
+PICTURED = 6  # junctions: deeper mazes are no picture
 DEEPEST = 24  # numbers of endpoints and trials stay far from the limits of int32
 
 
@@ -219,6 +222,61 @@ class ExtendedTMaze(AbstractEnvironment):
         )
         company, seen = arrived & self._company(everybody), arrived & seen[: self.robots]
         return state, self._time_step(state, company, seen, rewards, state.trial >= self.trials)
+
+    def viewer(self) -> Viewer | None:
+        """Robots in the maze, and all trials of the episode; None deeper than 6."""
+        if self.depth > PICTURED:
+            return None
+        robots = "1 robot" if self.robots == 1 else f"{self.robots} robots"
+        beside = f" beside a static one ({self.partner.upper()})" if self.partner else ""
+        rule = "all robots are" if self.objective == "converge" else "a robot is"
+        marks = [
+            Mark("dot", "c0", "a robot, in its own colour"),
+            Mark("square", "muted", "static robot"),
+            Mark("star", "c4", "endpoint with the reward: an outline, filled once it is observed"),
+            Mark("square", "c4", "in the trials: where the reward is"),
+            Mark("tick", "good", "below a trial: the reward was observed"),
+            Mark("cross", "bad", "below a trial: it was not"),
+        ]
+        return Viewer(
+            "maze",
+            f"{robots}{beside}, {self.depth}-deep, {self.objective.capitalize()}: the reward is "
+            f"observed if {rule} at its endpoint.",
+            self._shown,
+            {"depth": self.depth},
+            tuple(mark for mark in marks if self.partner or mark.text != "static robot"),
+            agent="robot",
+        )
+
+    def _shown(self, trace: Trace) -> dict[str, Any]:
+        """At every moment: the trial, how far everybody is on the way (`part` of the corridor
+        behind `level` turns, of which `turns` has the bits), and where the static robot goes; for
+        every trial where everybody went, and what they were told."""
+        state = trace.states
+        ends = np.flatnonzero(np.diff(state.trial)) + 1  # moments at which a trial is over
+        over = np.isin(np.arange(len(state.trial)), ends)
+        level = np.where(over, self.depth, state.junction)
+        lengths = state.lengths
+        if lengths is None:
+            lengths = np.full((len(level), self.depth), self.corridor[0])
+        long = lengths[np.arange(len(level)), np.clip(level, 0, self.depth - 1)]
+        part = np.where(over, 1.0, 1.0 - state.distance / long)
+        trials = np.arange(self.trials)
+        shown = {
+            "trial": state.trial - over,
+            "level": level,
+            "part": part.astype(np.float32),
+            "turns": state.endpoint,
+            "goal": state.goals[0][trials >> self.depth],
+            "endpoint": state.endpoint[ends],
+            "observed": trace.rewards["score"][ends - 1] > 0.0,
+            "company": trace.observations[ends, :, 1] > 0.0,
+            "reward": trace.observations[ends, :, 2] > 0.0,
+        }
+        if state.partner is not None:  # at the end of a trial it is already that of the next one
+            shown["partner"] = state.partner[np.maximum(np.arange(len(level)) - over, 0)]
+            shown["static"] = state.partner[ends - 1]
+        return shown
 
     def _goals(self, key: PRNGKeyArray) -> Int[Array, " 3"]:
         n = self.endpoints

@@ -10,6 +10,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt32
 
+from .viewer import Viewer
+
 
 class EnvironmentFailure(RuntimeError):
     """An environment raised, ended its process, hung, or returned what it must not.
@@ -181,6 +183,15 @@ class AbstractHostEnvironment(eqx.Module):
     def reported(self) -> str:
         """The reward signal by which a champion is judged."""
         return self.signals[-1]
+
+    @property
+    def unwrapped(self) -> "AbstractHostEnvironment":
+        """The task itself, within whatever delays its rewards."""
+        return self
+
+    def viewer(self) -> Viewer | None:
+        """How a page draws its episodes; None: it does not."""
+        return None
 
     @property
     def sizes(self) -> tuple[int, ...]:

@@ -23,7 +23,7 @@ of harvesting in total, here they are consecutive.
 """
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -32,8 +32,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from .. import require
-from ..types import TimeStep
+from ..types import TimeStep, Trace
 from .base import AbstractEnvironment
+from .viewer import Mark, Viewer
 
 BRACKETS = 36  # of 10° each, a ring of sensors
 CENTRE = 0.1  # share of the field's area in which rovers start
@@ -52,6 +53,16 @@ ATAN = (  # of t, t³, t⁵, ...
     0.0028662257,
 )
 REWARDS = ("global", "local", "mixed", "difference", "dpp")
+
+LEGEND = (
+    Mark("arrow", "c0", "a rover, in its own colour, and its path so far"),
+    Mark("ring", "muted", "activation distance of a POI, in as many arcs as rovers it needs"),
+    Mark("ring", "ink", "an arc is dark for each rover inside"),
+    Mark("rhombus", "ink", "POI that is not observed yet"),
+    Mark("diamond", "bad", "observed POI, with the step in which it was"),
+    Mark("line", "c0", "sensors, inner ring: other rovers"),
+    Mark("line", "c1", "sensors, outer ring: POIs not observed yet"),
+)
 
 Point = tuple[float, float]
 
@@ -281,6 +292,48 @@ class Rover(AbstractEnvironment):
         for place in np.asarray(state.position):
             picture[away(place) < 0.3] = (0, 92, 175)
         return picture
+
+    def viewer(self) -> Viewer:
+        """Rovers from above, and what each senses."""
+        needed = f"{self.coupling} rover{'s' * (self.coupling > 1)}"
+        return Viewer(
+            "rover",
+            f"{self.agents} rovers and {self.pois} POIs, each of which is observed once {needed} "
+            f"{'are' if self.coupling > 1 else 'is'} within {float(self.activation_distance):g} m "
+            "of it at the same time.",
+            self.shown,
+            {
+                "size": np.float32(self.size),
+                "activation_distance": np.float32(self.activation_distance),
+                "coupling": self.coupling,
+                "observation": self.observation,
+            },
+            LEGEND,
+            agent="rover",
+        )
+
+    def shown(self, trace: Trace) -> dict[str, Any]:
+        """What is drawn of an episode, leaves `[moments, ...]`: `position` (m) and `heading` (rad)
+        of the rovers, `observed`, how many rovers are `inside` of each POI's activation distance,
+        `share`, the global reward if the episode ended there, and `sensors` `[moments, rovers, 2,
+        36]`, of rovers and of POIs as in an observation; and `poi` `[pois, 2]` (m)."""
+        state = trace.states
+        paid = state.observed.astype(np.float32)
+        if state.nearness is not None:
+            paid = np.maximum(paid, state.nearness)
+        way = state.poi[:, None] - state.position[:, :, None]  # [moments, rovers, pois, 2]
+        near = np.sqrt(np.sum(way**2, axis=3)) <= np.float32(self.activation_distance)
+        start = 0 if self.observation == "relative" else 1  # of the first ring
+        rings = np.asarray(trace.observations)[:, :, start : start + 2 * BRACKETS]
+        return {
+            "position": state.position,
+            "heading": state.heading,
+            "poi": state.poi[0],
+            "observed": state.observed,
+            "inside": near.sum(axis=1),
+            "share": paid @ np.asarray(self.values),
+            "sensors": rings.reshape(*rings.shape[:2], 2, BRACKETS),
+        }
 
     def _places(self, key: PRNGKeyArray):
         """Start positions of rovers and POIs."""

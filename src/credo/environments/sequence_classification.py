@@ -35,6 +35,7 @@ class SequenceClassification(AbstractSequenceTask):
     """
 
     obs_range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
+    inputs: ClassVar[tuple[str, ...]] = ("signal",)
 
     depth: int = eqx.field(static=True, default=21)  # signals per sequence, at least 1
     min_gap: int = eqx.field(static=True, default=10)  # zeros between two signals, at least

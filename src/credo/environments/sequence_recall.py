@@ -13,6 +13,8 @@ Departures from the dissertation:
 - One encoding for evolution and gradient; the author's gradient version used another.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,6 +31,8 @@ class SequenceRecall(AbstractSequenceTask):
     The reward is the author's: at a junction [½·t·y + ½·(every turn so far was right)] / depth,
     with t the direction ±1 and y the answer in [-1, 1]. So an episode earns -½..1.
     """
+
+    inputs: ClassVar[tuple[str, ...]] = ("direction", "distance to the junction")
 
     depth: int = eqx.field(static=True, default=6)  # directions and junctions, at least 1
     min_corridor: int = eqx.field(static=True, default=10)  # steps per corridor, at least 1

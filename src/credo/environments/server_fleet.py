@@ -13,16 +13,28 @@ Departures from the code:
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .. import require
-from ..types import TimeStep
+from ..types import TimeStep, Trace
 from .base import AbstractEnvironment
+from .viewer import Mark, Viewer
+
+LEGEND = (
+    Mark("box", "good", "genuine device, with the requests that are pending"),
+    Mark("rhombus", "bad", "nefarious device; both are faint once nothing is pending"),
+    Mark("dot", "c0", "a server that acts in this step, in its own colour"),
+    Mark("ring", "c0", "a server that is busy; faint: away"),
+    Mark("line", "c0", "the device that it serves in this step"),
+    Mark("plus", "good", "+1 above a server: it has served a genuine request"),
+    Mark("minus", "bad", "−1: a nefarious one; 0: none was left"),
+)
 
 ACTS, BUSY, AWAY = 1.0, 0.0, -1.0  # a server's status, as observed
 
@@ -189,6 +201,35 @@ class ServerFleet(AbstractEnvironment):
             state.step + 1,
         )
         return state, self._time_step(state, jnp.sum(worth))
+
+    def viewer(self) -> Viewer:
+        """Servers and devices, and who serves whom."""
+        return Viewer(
+            "fleet",
+            f"{self.servers} servers and {self.devices} devices with {self.requests} requests "
+            "each; which devices are nefarious is found out by serving them.",
+            self._shown,
+            {"servers": self.servers, "devices": self.devices},
+            LEGEND,
+            agent="server",
+            speed=1.0,
+        )
+
+    def _shown(self, trace: Trace) -> dict[str, Any]:
+        """At every moment what is `pending` and each server's `status`; in every step the device
+        of its `choice` and what the request was `worth` to it: -1, and 0, for who does not act."""
+        state = trace.states
+        present = np.asarray(jax.vmap(self.present)(state.step))
+        acting = present & (state.busy == 0)
+        status = np.where(present, np.where(acting, ACTS, BUSY), AWAY)
+        worth = np.where(acting[:-1], state.told[1:].sum(axis=2), 0.0)
+        return {
+            "genuine": state.genuine[0],
+            "pending": state.pending,
+            "status": status.astype(int),
+            "choice": np.where(acting[:-1], trace.actions.argmax(axis=2), -1),
+            "worth": worth.astype(int),
+        }
 
     def present(self, step: Int[Array, ""]) -> Bool[Array, " servers"]:
         """Who is in the fleet at a step."""

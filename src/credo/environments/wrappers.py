@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
 from .. import require
-from ..types import Sequence, TimeStep
+from ..types import Sequence, TimeStep, Trace
 from .base import AbstractEnvironment, AbstractSequenceTask
 from .host import AbstractCopies, AbstractHostEnvironment, HostStep
+from .viewer import Viewer
 
 
 class Shortened(AbstractSequenceTask):
@@ -41,6 +42,49 @@ class Shortened(AbstractSequenceTask):
         length = jnp.minimum(length, sequence.length)
         scored = sequence.scored & (jnp.arange(self.max_steps) < length)
         return Sequence(sequence.inputs, sequence.targets, scored, length)
+
+    @property
+    def unwrapped(self) -> AbstractEnvironment:
+        return self.task.unwrapped
+
+    def lesson(self, sequence):
+        return self.task.lesson(sequence)
+
+    def reward(self, answer, target, scored, perfect):
+        return self.task.reward(answer, target, scored, perfect)
+
+
+class Given(AbstractSequenceTask):
+    """A sequence task of which the sequences are given: in `rollout.evaluate` every features-first
+    policy answers each of them once. An episode alone draws one of them."""
+
+    task: AbstractSequenceTask  # that says what an answer earns
+    sequences: Sequence  # leaves [n, ...], at least one
+
+    @classmethod
+    def alone(cls, task: AbstractSequenceTask, sequence: Sequence) -> "Given":
+        """This one sequence."""
+        return cls(task, jax.tree.map(lambda x: jnp.asarray(x)[None], sequence))
+
+    @property
+    def n(self) -> int:
+        return self.sequences.inputs.shape[0]
+
+    @property
+    def obs_size(self) -> int:
+        return self.sequences.inputs.shape[2]
+
+    @property
+    def max_steps(self) -> int:
+        return self.sequences.inputs.shape[1]
+
+    @property
+    def unwrapped(self) -> AbstractEnvironment:
+        return self.task.unwrapped
+
+    def sample(self, *, key: PRNGKeyArray) -> Sequence:
+        i = jax.random.randint(key, (), 0, self.n)
+        return jax.tree.map(lambda x: x[i], self.sequences)
 
     def lesson(self, sequence):
         return self.task.lesson(sequence)
@@ -77,6 +121,23 @@ class AbstractWrapper(AbstractEnvironment):
     @property
     def reported(self) -> str:
         return self.env.reported
+
+    @property
+    def unwrapped(self) -> AbstractEnvironment:
+        return self.env.unwrapped
+
+    def bare(self, state: PyTree) -> PyTree:
+        return self.env.bare(state)
+
+    def viewer(self) -> Viewer | None:
+        """That of the task itself."""
+        inner = self.unwrapped.viewer()
+
+        def episode(trace: Trace):
+            assert inner is not None
+            return inner.episode(dataclasses.replace(trace, states=self.bare(trace.states)))
+
+        return inner and dataclasses.replace(inner, episode=episode)
 
 
 class NoisyObservations(AbstractWrapper):
@@ -143,6 +204,9 @@ class DelayedReward(AbstractWrapper):
     def obs_range(self) -> tuple[float, float]:
         return self.env.obs_range
 
+    def bare(self, state: DelayedState) -> PyTree:
+        return self.env.bare(state.inner)
+
     def reset(self, *, key: PRNGKeyArray) -> tuple[DelayedState, TimeStep]:
         inner, first = self.env.reset(key=key)
         return DelayedState(inner, first.rewards), first  # they are 0
@@ -193,6 +257,10 @@ class DelayedHostReward(AbstractHostEnvironment):
     @property
     def reported(self) -> str:
         return self.env.reported
+
+    @property
+    def unwrapped(self) -> AbstractHostEnvironment:
+        return self.env.unwrapped
 
     @property
     def reward_shapes(self) -> dict[str, tuple[int, ...]]:

@@ -14,8 +14,9 @@ from ..compilation import jit
 from ..environments.base import AbstractSequenceTask
 from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
+from ..environments.wrappers import Given
 from ..networks.mmu import MMU
-from ..rollout import play_sequences
+from ..rollout import evaluate
 from ..runs.store import Run
 from .base import Cell
 
@@ -83,8 +84,6 @@ def success(
 ) -> Float[np.ndarray, " policies"]:
     """Strict success of every policy on the same fresh sequences. No training run draws from
     the seeds used here: runs have seeds below 10,000."""
-    from ..rollout import evaluate
-
     evaluation = evaluate(task, policies, episodes, key=jax.random.key(seed))
     return np.asarray(jnp.mean(evaluation.returns["success"], axis=1))
 
@@ -101,8 +100,8 @@ def success_with_gap(
         return task.lay_out(signals, jnp.full(task.depth, gap))
 
     sequences = jax.vmap(sequence)(jax.random.split(key, episodes))
-    sequences = jax.tree.map(lambda x: x[None], sequences)
-    return jnp.mean(play_sequences(task, policies, sequences).returns["success"], axis=1)
+    played = evaluate(Given(task, sequences), policies, episodes, key=key)
+    return jnp.mean(played.returns["success"], axis=1)
 
 
 def first_mistakes(

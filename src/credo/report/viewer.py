@@ -1,0 +1,138 @@
+"""Episodes that play in the browser: one HTML page for a set of traces, without a network.
+
+A task says by `env.viewer()` how its world is drawn; time and its controls, rewards by name, the
+policy's memory and the legend are the same for all (`static/viewer.js`).
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files as resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from ..analysis.memory import known_memory
+from ..environments.viewer import Viewer
+from ..runs import files
+from ..types import Trace
+
+SPEEDS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # steps per second to choose from
+
+
+def write(
+    viewer: Viewer, traces: Mapping[str, Trace], path: str | os.PathLike[str], **options: Any
+) -> Path:
+    """Write the page that plays these episodes to `path` and return it. A reader never sees half a
+    file. Arguments and errors otherwise as of `page`."""
+    path = Path(path)
+    files.write_text(path, page(viewer, traces, **options))
+    return path
+
+
+def page(
+    viewer: Viewer, traces: Mapping[str, Trace], *, title: str, speed: float | None = None
+) -> str:
+    """The page as HTML.
+
+    **Arguments:** `traces`: by the names of the episodes, as `credo.rollout.record` keeps them;
+    `speed`: steps per second at first, more than 0; None: the viewer's.
+
+    **Raises:** `ValueError` if there is no episode, or a number in one is not finite.
+    """
+    if not traces:
+        raise ValueError("there is no episode to play: give at least one")
+    first = next(iter(traces.values()))
+    agents = None if first.active is None else first.active.shape[1]
+    speed = float(f"{speed or viewer.speed:g}")
+    data = {
+        "agents": agents,
+        "agent": viewer.agent,
+        "task": viewer.task,
+        "legend": [vars(mark) for mark in viewer.legend],
+        "episodes": [{"name": name, **_episode(viewer, trace)} for name, trace in traces.items()],
+    }
+    known = f"static/viewer-{viewer.drawing}.js"
+    own = Path(viewer.drawing)
+    return _template("viewer.html").render(
+        title=title,
+        lead=viewer.lead,
+        drawing=own.stem,
+        names=list(traces),
+        agents=agents,
+        agent=viewer.agent,
+        speeds=[f"{s:g}" for s in sorted({*SPEEDS, speed})],
+        speed=f"{speed:g}",
+        data=_inside_script(json.dumps(_short(data), separators=(",", ":"), allow_nan=False)),
+        style=Markup(_text("static/viewer.css")),
+        player=Markup(_text("static/viewer.js")),
+        script=Markup(own.read_text("utf-8") if own.suffix == ".js" else _text(known)),
+    )
+
+
+def _episode(viewer: Viewer, trace: Trace) -> dict[str, Any]:
+    """What a page holds of an episode: of the task, and of every task."""
+    shown = viewer.rewards or tuple(trace.rewards)
+    return {
+        "steps": int(trace.length),
+        "ended": "the task ended" if trace.terminated else "time ran out",
+        "rewards": {name: trace.rewards[name] for name in shown},
+        "memory": _memory(trace),
+        **viewer.episode(trace),
+    }
+
+
+def _memory(trace: Trace) -> dict[str, Any] | None:
+    """The policy's memory at every moment, `[moments, cells]` or, of each agent, `[moments, agents,
+    cells]`; None: it has none, or none that is known."""
+    memory = known_memory(trace.carries)
+    if memory is None or memory.size == 0 or memory.ndim not in (2, 3):
+        return None
+    if memory.ndim == 3 and (trace.active is None or memory.shape[1] != trace.active.shape[1]):
+        return None
+    return {"shared": memory.ndim == 2, "values": np.asarray(memory, np.float32)}
+
+
+def _inside_script(text: str) -> Markup:
+    """JSON that no "<" can end the script element of."""
+    return Markup(text.replace("<", "\\u003c"))
+
+
+def _text(name: str) -> str:
+    return resources("credo.report").joinpath(name).read_text("utf-8")
+
+
+@cache
+def _template(name: str) -> jinja2.Template:
+    loader = jinja2.PackageLoader("credo.report", "templates")
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
+    return environment.get_template(name)
+
+
+def _short(value: Any) -> Any:
+    """Plain lists of the shortest numbers that are read back as the same 32 bits."""
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, dict):
+        return {name: _short(x) for name, x in value.items()}
+    if isinstance(value, list | tuple):
+        return [_short(x) for x in value]
+    x = np.asarray(value)
+    if not np.isfinite(x).all():
+        raise ValueError("an episode holds a number that is not finite: it cannot be replayed")
+    if x.dtype.kind != "f":
+        return x.astype(int).tolist()
+    if x.ndim:
+        return [_short(row) for row in x] if x.ndim > 1 else [_number(s) for s in x.astype(str)]
+    return _number(str(x))
+
+
+def _number(text: str) -> float | int:
+    number = float(text)
+    return int(number) if number.is_integer() else number
