@@ -34,8 +34,8 @@ Plot = Figure | HeatMap | Tracks
 Looks = Mapping[str, Look]  # of curves, by label
 
 WIDTH, HEIGHT = 4.8, 3.1  # inches, without the legend
-MOST_POINTS = 400  # drawn per line
-MOST_SEED_POINTS = 24_000  # drawn per figure by the lines of single seeds
+MOST_POINTS = 250  # drawn per line
+MOST_SEED_POINTS = 4_000  # drawn per figure by the lines of single seeds
 MOST_TIPS = 100  # points of a curve that a tooltip tells of
 FEW_POINTS = 25  # are marked
 RESAMPLES = 500  # of a curve's interval, for every point at once
@@ -117,7 +117,8 @@ def coinciding(figure: Figure) -> list[list[int]]:
             other = drawn[group[0]]
             inside = (curve.x >= other.x[0]) & (curve.x <= other.x[-1])
             apart = np.abs(curve.centre - np.interp(curve.x, other.x, other.centre))[inside]
-            if 2 * len(apart) >= len(curve.x) > 1 and np.mean(apart <= near) >= 0.9:
+            apart, count = apart[np.isfinite(apart)], np.isfinite(curve.centre).sum()
+            if 2 * len(apart) >= count > 0 and np.mean(apart <= near) >= 0.9:
                 group.append(i)
                 break
         else:
@@ -200,14 +201,14 @@ def compact(tag: str, prefix: str) -> str:
     tag = re.sub(r'\b(id="|xlink:href="#|url\(#)', rf"\g<1>{prefix}", tag)
     tag = tag.replace("xlink:href", "href").replace("base64,\n", "base64,")
     tag = re.sub(r"font-family: [^;\"]*", f"font-family: {FONT}", tag)
-    return re.sub(r"(\.\d)\d+", r"\1", tag) if tag.startswith("<path") else tag
+    return re.sub(r"(\.\d)\d+| \n", r"\1", tag) if tag.startswith("<path") else tag
 
 
 # ------------------------------------------------------------------------------------ drawing
 
 
 def draw(figure: Plot, theme: Theme, looks: Looks | None = None, legend: bool = True) -> Canvas:
-    """The figure on a canvas of its own, with no title. Arguments as of `figure_svg`."""
+    """The figure on a canvas of its own, with no title. Arguments as of `picture`."""
     canvas = Canvas(figsize=(WIDTH, HEIGHT), layout="constrained")
     FigureCanvasAgg(canvas)  # measures text; saving as SVG brings its own
     axes = canvas.add_subplot()
@@ -249,7 +250,7 @@ def draw_curves(
         )
         lines.append(draw_curve(axes, i, curve, figure, look))
     axes.grid(axis="y", color=theme.grid)
-    axes.margins(x=0.02 if figure.joined else 0.06)
+    axes.margins(x=0.02)
     scale(axes, figure)
     for line in figure.references:
         axes.axhline(line.value, color=theme.muted, linewidth=1, dashes=(4, 3), zorder=1.5)
@@ -268,6 +269,8 @@ def scale(axes: Axes, figure: Figure) -> None:
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     elif not figure.joined and len(places) <= 9:
         axes.set_xticks(places)
+        beside = 0.06 * (places[-1] - places[0]) or 0.5  # room for dots that are moved aside
+        axes.set_xlim(places[0] - beside, places[-1] + beside)
     elif np.all(places == np.round(places)):
         axes.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=[1, 2, 2.5, 5, 10]))
     if figure.y_range is not None:
@@ -293,7 +296,8 @@ def draw_curve(axes: Axes, index: int, curve: Curve, figure: Figure, look: Drawi
     stands for it in the legend."""
     shown = sampled(curve, figure.centre, figure.log_x, drawn_points(figure))
     several = sum(np.shape(other.runs)[0] for other in figure.curves) > 20
-    marker = {"marker": "o", "ms": 2.0 + look.width} if len(shown.x) <= FEW_POINTS else {}
+    few = np.isfinite(shown.centre).sum() <= FEW_POINTS
+    marker = {"marker": "o", "ms": 2.0 + look.width} if few else {}
     artists: list[Artist] = []
     if len(shown.runs) > 1 and figure.joined:
         thin: dict[str, Any] = {"lw": 0.6, "alpha": 0.2 if several else 0.35, "zorder": 2}
@@ -332,7 +336,7 @@ class Sampled:
 def drawn_points(figure: Figure) -> int:
     """Points per line, so that many lines do not make a heavy page."""
     lines = sum(np.shape(curve.runs)[0] for curve in figure.curves)
-    return int(np.clip(MOST_SEED_POINTS // lines, 100, MOST_POINTS))
+    return int(np.clip(MOST_SEED_POINTS // lines, 40, MOST_POINTS))
 
 
 @lru_cache(maxsize=64)

@@ -22,7 +22,7 @@ from ..learners.base import AbstractLearner
 from ..runs import config
 from ..runs.loop import Run, RunError
 from .pages import write as write_page
-from .sections import Curve, Figure, Page, Reference, Section, Summary, Table
+from .sections import Cell, Curve, Figure, Page, Reference, Section, Summary, Table
 
 Tree = Mapping[str, Any]  # of a record: an object as `config.to_tree` makes it
 Groups = Mapping[str, list[Run]]  # runs that differ in their seed alone, by label
@@ -98,7 +98,10 @@ def _once(texts: Iterable[str]) -> list[str]:
 
 
 def _lead(runs: Sequence[Run]) -> str:
-    tasks = {config.brief(run.config["algorithm"]["env"]) for run in runs}
+    tasks = {
+        str(tree["id"]) if "id" in tree else config.brief(tree)
+        for tree in (run.config["algorithm"]["env"] for run in runs)
+    }
     return f"Task: {'; '.join(sorted(tasks))}."
 
 
@@ -224,8 +227,8 @@ def _figure(runs: Groups, metric: str, title: str) -> Figure:
     curves = [_curve(label, group, metric, unit) for label, group in runs.items()]
     known = [_bounds(group[0]) for group in runs.values()] if metric == "champion_score" else []
     levels = dict.fromkeys(level for pair in known if pair for level in pair)
-    names = {"champion_score": "success" if levels else "return"}
-    return Figure(title, unit, names.get(metric, metric.replace("_", " ")), curves, tuple(levels))
+    names = {"champion_score": "success" if levels else "return", "fitness_max": "fitness"}
+    return Figure(title, unit, names.get(metric, metric), curves, tuple(levels))
 
 
 def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
@@ -237,6 +240,7 @@ def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
         values = np.stack([c[metric][:length] for c in columns])
         return Curve(label, columns[0][unit][:length], values)
     grid = attribution.axis([min((c[unit] for c in columns), key=lambda x: x[-1])], 400)
+    grid = np.union1d(grid, [max(float(c[unit][0]) for c in columns)])  # where all have begun
     return Curve(label, grid, [attribution.on_grid(c[unit], c[metric], grid) for c in columns])
 
 
@@ -258,20 +262,22 @@ def _table(runs: Groups) -> Table:
     known = [_bounds(group[0]) for group in runs.values()]
     rows = []
     for (label, group), bounds in zip(runs.items(), known, strict=True):
-        low, high = bounds or (None, None)
-        seeds = [run.config["seed"] for run in group]
         scores = [float(run.metrics["champion_score"][-1]) for run in group]
+        score = Summary(scores, [run.config["seed"] for run in group])
         last = min(int(run.metrics["generation"][-1]) for run in group)
-        told = [f"{low.value:.3f} ({low.label.partition(': ')[2]})" if low else None]
-        told += [Summary(scores, seeds), high.value if high else None]
-        rows.append([label, len(group), last, *told])
-    columns = ["algorithm", "seeds", "generations", "baseline", "best policy", "upper bound"]
+        told: list[Cell] = [None, None]
+        if bounds is not None:
+            low, high = bounds
+            told = [f"{low.value:.3f} ({low.label.partition(': ')[2]})", high.value]
+        rows.append([label, score, *(told if any(known) else ()), len(group), last])
+    beside = ["baseline", "upper bound"] if any(known) else []
     caption = f"On {_episodes(runs)} fresh episodes; `credo evaluate` plays more."
-    if not any(known):
-        columns = [name for name in columns if name not in ("baseline", "upper bound")]
-        rows = [[*row[:3], row[4]] for row in rows]
-        caption += " No baseline and no upper bound of this task are known."
-    return Table("Score of the best policy, as last tested", columns, rows, caption)
+    return Table(
+        "Score of the best policy, as last tested",
+        ["algorithm", "best policy", *beside, "seeds", "generations"],
+        rows,
+        caption + ("" if beside else " No baseline and no upper bound of this task are known."),
+    )
 
 
 def _episodes(runs: Groups) -> str:
@@ -366,19 +372,19 @@ def learner_names(learners: Sequence[AbstractLearner | Tree]) -> list[str]:
 
 
 def _settings(runs: Groups) -> list[Table]:
-    """Settings that differ, and all of them, where those are marked."""
+    """Settings that several algorithms have and that differ; and all, where those are marked."""
     flat = [config.flatten(_indexed(group[0].config["algorithm"])) for group in runs.values()]
     keys = list(dict.fromkeys(key for tree in flat for key in tree))
-    marked = set(differing(flat))
+    unlike = {key for key in differing(flat) if sum(key in tree for tree in flat) > 1}
     rows = {key: [key, *(_text(tree[key]) if key in tree else "" for tree in flat)] for key in keys}
-    unlike = [rows[key] for key in keys if key in marked]
     columns = ["setting", *runs]
-    found = Table(
+    every = Table(
         "All settings",
         columns,
         list(rows.values()),
         caption="Marked: settings that differ." if unlike else "",
-        marked=[i for i, key in enumerate(keys) if key in marked],
+        marked=[i for i, key in enumerate(keys) if key in unlike],
         folded=True,
     )
-    return [Table("Settings that differ", columns, unlike), found] if unlike else [found]
+    few = Table("Settings that differ", columns, [rows[key] for key in keys if key in unlike])
+    return [few, every] if unlike else [every]
