@@ -21,7 +21,7 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text as Words
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
 from matplotlib.transforms import offset_copy
 from numpy.typing import NDArray
 
@@ -359,15 +359,9 @@ def sampled(curve: Curve, centre: str, log_x: bool, points: int) -> Sampled:
 
 def shorten_ticks(axis: Axis, always: bool = False) -> None:
     """20k and 1M for 20000 and 1e6."""
-    if always or np.abs(axis.get_view_interval()).max() >= 1e4:
-        axis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))
-
-
-def short_number(value: float) -> str:
-    for size, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(value) >= size:
-            return f"{value / size:g}{suffix}".replace("-", "−")
-    return f"{value:g}".replace("-", "−")
+    low, high = np.sort(np.abs(axis.get_view_interval()))
+    if high >= 1e4 or (always and low >= 0.5):  # thousandths would get a unit too
+        axis.set_major_formatter(EngFormatter(sep=""))
 
 
 def add_legend(canvas: Canvas, handles: Sequence[Artist], theme: Theme) -> None:

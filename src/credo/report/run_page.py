@@ -4,7 +4,6 @@ It reads what runs have recorded: no environment is opened, and no code that a r
 imported but Credo's own. So a page about a stranger's run needs no trust in them.
 """
 
-import itertools
 import json
 import pathlib
 import shlex
@@ -151,20 +150,16 @@ def group_labels(trees: Sequence[Tree]) -> list[str]:
 
 
 def telling(flat: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The fewest fields, at most three, by which settings can be told apart, or nearly so."""
-    keys = differing(flat)
+    """At most three fields by which settings can be told apart, or nearly so."""
 
     def kinds(fields: Sequence[str]) -> int:
         return len({tuple(str(tree.get(key)) for key in fields) for tree in flat})
 
-    # Of many fields, the pairs and triples of those that tell most.
-    keys = sorted(keys, key=lambda key: -kinds([key]))[:12]
-    choices = [
-        fields
-        for size in range(1, MOST_FIELDS + 1)
-        for fields in itertools.combinations(keys, size)
-    ]
-    return list(max(choices, key=lambda fields: (kinds(fields), -len(fields))))
+    found: list[str] = []
+    keys = differing(flat)
+    while keys and len(found) < MOST_FIELDS and kinds(found) < len(flat):
+        found.append(max(keys, key=lambda key: kinds([*found, key])))
+    return found
 
 
 def differing(flat: Sequence[Mapping[str, Any]]) -> list[str]:
