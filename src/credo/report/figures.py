@@ -34,6 +34,7 @@ Plot = Figure | HeatMap | Tracks
 Looks = Mapping[str, Look]  # of curves, by label
 
 WIDTH, HEIGHT = 4.8, 3.1  # inches, without the legend
+LINE = 1.8  # points
 MOST_POINTS = 250  # drawn per line
 MOST_SEED_POINTS = 4_000  # drawn per figure by the lines of single seeds
 MOST_TIPS = 100  # points of a curve that a tooltip tells of
@@ -95,8 +96,9 @@ def note(figure: Plot) -> str:
             f"{centre.capitalize()} over {count} runs. {band}: its 95 % bootstrap interval. "
             f"{each}: each run."
         ]
-    names = [curve.label for curve in figure.curves]
-    parts += [f"{' and '.join(names[i] for i in group)} coincide." for group in coinciding(figure)]
+    for group in coinciding(figure):
+        *others, last = [figure.curves[i].label for i in group]
+        parts.append(f"{', '.join(others)} and {last} coincide.")
     longest = max(np.shape(curve.x)[0] for curve in figure.curves)
     if longest > drawn_points(figure):
         parts.append(f"Up to {drawn_points(figure)} of {longest:,} points are drawn, unsmoothed.")
@@ -245,7 +247,7 @@ def draw_curves(
             color=theme.curves[looks[curve.label].color],
             dashes=DASHES[looks[curve.label].dash],
             # Of curves that coincide each is drawn inside the one before.
-            width=1.8 + 2.0 * sum(inside),
+            width=LINE + 2.0 * sum(inside),
             transform=offset_copy(axes.transData, fig=canvas, x=shift, units="points"),
         )
         lines.append(draw_curve(axes, i, curve, figure, look))
@@ -290,6 +292,11 @@ class Drawing:
     width: float  # points
     transform: Any
 
+    @property
+    def pattern(self) -> list[float]:
+        """The dashes in widths of this line, as long as those of any other."""
+        return [x * LINE / self.width for x in self.dashes]
+
 
 def draw_curve(axes: Axes, index: int, curve: Curve, figure: Figure, look: Drawing) -> Line2D:
     """Runs, interval and centre of one curve, whose ids begin with `curve-index-`; the line that
@@ -312,7 +319,7 @@ def draw_curve(axes: Axes, index: int, curve: Curve, figure: Figure, look: Drawi
         artists.append(axes.vlines(shown.x, shown.low, shown.high, **bars, **beside))
     (line,) = axes.plot(
         *(shown.x, shown.centre),
-        **{"color": look.color, "lw": look.width, "dashes": look.dashes, "zorder": 3, **marker},
+        **{"color": look.color, "lw": look.width, "dashes": look.pattern, "zorder": 3, **marker},
         **({} if figure.joined else {"alpha": 0.9}),
         **beside,
         label=textwrap.fill(curve.label, 56),

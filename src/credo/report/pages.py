@@ -233,6 +233,6 @@ def _template(name: str) -> jinja2.Template:
         "numeric": numeric,
         "hidden_runs": hidden_runs,
         "TALL": TALL,
-        "dashes": [" ".join(f"{1.8 * x:g}" for x in dash) for dash in DASHES],
+        "dashes": [" ".join(f"{figures.LINE * x:g}" for x in dash) for dash in DASHES],
     }
     return environment.get_template(name)

@@ -234,7 +234,7 @@ def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
         length = min(len(c[unit]) for c in columns)
         values = np.stack([c[metric][:length] for c in columns])
         return Curve(label, columns[0][unit][:length], values)
-    grid = attribution.axis([min((c[unit] for c in columns), key=lambda x: x[-1])], 400)
+    grid = attribution.axis([min((c[unit] for c in columns), key=lambda x: x[-1])], 240)
     grid = np.union1d(grid, [max(float(c[unit][0]) for c in columns)])  # where all have begun
     return Curve(label, grid, [attribution.on_grid(c[unit], c[metric], grid) for c in columns])
 
