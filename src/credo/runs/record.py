@@ -19,7 +19,7 @@ import json
 import os
 import pathlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from . import files, trust
@@ -202,7 +202,7 @@ def _maybe(test: Test) -> Test:
     return lambda value: value is None or test(value)
 
 
-def _has(needed: tuple[str, ...] = (), **tests: Test) -> Test:
+def _has(needed: Iterable[str] = (), /, **tests: Test) -> Test:
     """An object with the needed entries; each that is tested passes, where it is there."""
     return lambda value: (
         isinstance(value, dict)
@@ -212,19 +212,19 @@ def _has(needed: tuple[str, ...] = (), **tests: Test) -> Test:
 
 
 def _object(**tests: Test) -> Test:
-    named = {"class": lambda value: CLASS.fullmatch(str(value)) is not None}
+    named: dict[str, Test] = {"class": lambda value: CLASS.fullmatch(str(value)) is not None}
     return _has(("class", *tests), **named, **tests)
 
 
 def _is_budget(value: Any) -> bool:
-    limits = {"generations": _maybe(_whole(1)), "frames": _maybe(_whole(1))}
+    limits: dict[str, Test] = {"generations": _maybe(_whole(1)), "frames": _maybe(_whole(1))}
     right = _has(**limits, stop_at=_maybe(_is(int, float)))(value)
     known = right and not set(value) - {*limits, "stop_at"}
     return known and any(value.get(name) is not None for name in limits)
 
 
 SIZE, TEXT = _maybe(_whole(0, 2**31)), _is(str)
-MACHINE = {
+MACHINE: dict[str, Test] = {
     "versions": lambda value: isinstance(value, dict) and all(map(TEXT, value.values())),
     "cores": _whole(0, 2**31),
     **dict.fromkeys(("processor", "device", "system"), TEXT),
