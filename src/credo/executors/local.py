@@ -152,6 +152,9 @@ def run(jobs: Sequence[Job], workers: int | None = None, *, title: str = "runs")
     all have been tried, `Interrupted` after a signal: the workers save first.
     """
     waiting = [job for job in jobs if not job.finished()]
+    for job in jobs:
+        if job.again and job not in waiting:
+            screen.say(f"{job.path} is finished: to go on give a larger --generations or --frames")
     if not waiting:
         return
     crew = _Crew(waiting, Board(title, len(jobs), len(waiting)))
