@@ -458,25 +458,29 @@ def test_every_run_of_a_folder_is_resumed(credo, seeds, monkeypatch):
     monkeypatch.setattr("credo.executors.local.run", lambda jobs, **_: given.extend(jobs))
     assert credo(f"resume {seeds} --generations 20 --keep 2")[0] == 0
     assert [(job.path.name, job.seed) for job in given] == [("seed-3", 3), ("seed-11", 3)]
-    assert [(job.generations, job.frames, job.keep) for job in given] == [(20, None, 2)] * 2
+    told = [(job.options.generations, job.options.frames, job.options.keep) for job in given]
+    assert told == [(20, None, 2)] * 2
     given.clear()
     assert credo(f"resume {seeds} --stop-at 2")[0] == 0
-    assert [(job.generations, job.stop_at) for job in given] == [(10, 2.0)] * 2
+    assert [(job.budget.generations, job.budget.stop_at) for job in given] == [(10, 2.0)] * 2
     assert [job.finished() for job in given] == [True, True]
 
 
 def test_what_resume_is_told_reaches_the_loop(credo, seeds, run, monkeypatch):
     told = []
-    resumed = lambda path, **fields: told.append((path, fields)) or Run(path)  # noqa: E731
+    resumed = lambda path, options, **again: told.append((path, options, again))  # noqa: E731
     monkeypatch.setattr("credo.runs.loop.resume", resumed)
+    sent = lambda jobs, **_: [resumed(job.path, job.options, **job.again) for job in jobs]  # noqa: E731
+    monkeypatch.setattr("credo.executors.local.run", sent)
     words = "--set mutation.strength=0.5 --set episodes=5 --trust --without-replay"
     assert credo(f"resume {run} {words} --wall-clock 2m")[0] == 0
     assert credo(f"resume {seeds} {words}")[0] == 0
-    assert [path for path, _ in told] == [run, *sorted(pathlib.Path(seeds).glob("*"), reverse=True)]
-    for _, fields in told:
+    paths = [run, *sorted(pathlib.Path(seeds).glob("*"), reverse=True)]
+    assert [path for path, *_ in told] == paths
+    for _, _, fields in told:
         assert fields["set"] == {"mutation.strength": 0.5, "episodes": 5}
         assert (fields["trust"], fields["without_replay"]) == (True, True)
-    assert told[0][1]["wall_clock"] == 120.0
+    assert told[0][1].wall_clock == 120.0
     code, _, err = credo(f"resume {run} --set mutation.strngth=0.5")
     assert code == 2
     assert "did you mean 'strength'?" in err
