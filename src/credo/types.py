@@ -99,10 +99,10 @@ class Trace(eqx.Module):
 
     observations: Float[Array, "moments *agents obs"]
     states: PyTree  # of a task in JAX, leaves [moments, ...]; None: the task is outside JAX
-    active: Bool[Array, "moments agents"] | None  # who acts in the step to come; None: no team
     carries: PyTree  # the policy's memory, leaves [moments, ...]
     actions: Float[Array, "steps *agents act"]  # as they were played: finite, in [-1, 1]
     rewards: dict[str, Float[Array, "steps *agents"]]
+    active: Bool[Array, "steps agents"] | None  # whose action counted; None: no team
     terminated: Bool[Array, ""]  # the task ended the episode
     truncated: Bool[Array, ""]  # the clock did
     length: Int[Array, ""]  # steps
@@ -114,8 +114,8 @@ class Trace(eqx.Module):
         def until(last: int, part: Any) -> Any:
             return jax.tree.map(lambda x: plain(x)[:last], part)
 
-        seen = (self.observations, self.states, self.active, self.carries)
-        done = (self.actions, self.rewards)
+        seen = (self.observations, self.states, self.carries)
+        done = (self.actions, self.rewards, self.active)
         ends = map(np.asarray, (self.terminated, self.truncated, self.length))
         return Trace(*until(steps + 1, seen), *until(steps, done), *ends)
 

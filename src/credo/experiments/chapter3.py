@@ -14,8 +14,8 @@ from ..compilation import jit
 from ..environments.base import AbstractSequenceTask
 from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
-from ..networks.mmu import MMU
 from ..environments.wrappers import Given
+from ..networks.mmu import MMU
 from ..rollout import evaluate
 from ..runs.loop import Run
 from .base import Cell
