@@ -19,7 +19,7 @@ from credo.environments.rover import Rover
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
 from credo.environments.server_fleet import ServerFleet
-from credo.environments.wrappers import Given, delayed
+from credo.environments.wrappers import Given, NoisyObservations, Shortened, delayed
 from credo.networks.base import AbstractPolicy
 from credo.networks.dmmu import DMMU
 from credo.networks.exploration import Explorer, GaussianNoise
@@ -658,7 +658,7 @@ def test_what_is_recorded_is_what_evaluation_plays(name):
         assert trace.terminated != trace.truncated
         seen = jax.tree.leaves((trace.observations, trace.states, trace.carries))
         assert {len(x) for x in seen} == {steps + 1}
-        assert all(isinstance(x, np.ndarray) for x in jax.tree.leaves(trace))
+        assert all(isinstance(x, np.ndarray | np.generic) for x in jax.tree.leaves(trace))
         assert np.abs(trace.actions).max() <= 1.0
         for reward, paid in trace.rewards.items():
             np.testing.assert_allclose(

@@ -4,6 +4,7 @@ There are two ways in. A population plays for its returns: `evaluate`, and `coll
 keeps the transitions. One policy is looked at: `record` keeps an episode of it, moment by moment.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -264,17 +265,18 @@ def _record(env: AbstractEnvironment, policy: AbstractPolicy, *, key: PRNGKeyArr
         action, carry = policy(obs, carry)
         action = jnp.clip(jnp.where(jnp.isfinite(action), action, 0.0), -1.0, 1.0)
         state, now = env.step(state, action, key=jax.random.fold_in(step_key, t))
-        done = (action, now.rewards, active)
-        seen = (now.obs, state, carry)
-        return (state, (now.obs, now.active), carry), (seen, done, now.terminated, now.truncated)
+        done = (action, now.rewards, active, now.terminated, now.truncated)
+        return (state, (now.obs, now.active), carry), ((now.obs, state, carry), done)
 
     start = (state, (first.obs, first.active), carry)
-    _, (later, done, *ends) = jax.lax.scan(advance, start, jnp.arange(env.max_steps))
-    first_seen = (first.obs, state, carry)
-    seen = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), first_seen, later)
-    over = ends[0] | ends[1]
+    _, (later, done) = jax.lax.scan(advance, start, jnp.arange(env.max_steps))
+    seen = (first.obs, state, carry)
+    seen = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), seen, later)
+    actions, rewards, active, terminated, truncated = done
+    over = terminated | truncated
     last = jnp.where(jnp.any(over), jnp.argmax(over), env.max_steps - 1)
-    return Trace(*seen, *done, ends[0][last], ends[1][last], last + 1)
+    ends = (terminated[last], truncated[last], last + 1)
+    return Trace(seen[0], seen[1], seen[2], actions, rewards, active, *ends)
 
 
 def _record_on_host(
@@ -295,17 +297,11 @@ def _record_on_host(
     if not len(seen):
         why = env.copies(1).failure_text(0)
         raise EnvironmentFailure(f"the episode failed, or its policy said NaN: {why}")
-    return Trace(
-        np.concatenate([seen, later[-1:]]),
-        None,
-        jax.tree.map(lambda *xs: plain(jnp.stack(xs))[:, 0, 0], *carries),
-        np.clip(actions, -1.0, 1.0),
-        rewards,
-        active,
-        ~truncated[-1],
-        truncated[-1],
-        np.int32(len(seen)),
-    )
+    seen = np.concatenate([seen, later[-1:]])
+    kept = jax.tree.map(lambda *xs: plain(jnp.stack(xs))[:, 0, 0], *carries)
+    played = (np.clip(actions, -1.0, 1.0), rewards, active)
+    ends = (~truncated[-1], truncated[-1], np.int32(len(actions)))
+    return Trace(seen, None, kept, *played, *ends)
 
 
 def _play_on_host(
@@ -337,21 +333,13 @@ def _play_on_host(
     return Evaluation(*sums), Experience(Transition(*told.rows()), None)
 
 
+@dataclasses.dataclass(frozen=True)
 class _Form:
-    """A population without its arrays: what a program is compiled for. Hashed once, since
-    `equinox.filter_jit` would look at every leaf anew at every step, which takes longer than the
-    step."""
+    """A population without its arrays: what a program is compiled for. `equinox.filter_jit` would
+    look at every leaf anew at every step, which takes longer than the step."""
 
-    def __init__(self, structure: Any, rest: tuple[Any, ...]):
-        self.structure, self.rest = structure, rest
-        self.hash = hash((structure, rest))
-
-    def __hash__(self) -> int:
-        return self.hash
-
-    def __eq__(self, other: object) -> bool:
-        same = isinstance(other, _Form) and self.structure == other.structure
-        return self is other or (same and self.rest == other.rest)
+    structure: Any
+    rest: tuple[Any, ...]
 
     def filled(self, arrays: list[Array | None]) -> PyTree:
         """The population again."""

@@ -262,9 +262,9 @@ class ExtendedTMaze(AbstractEnvironment):
         long = lengths[np.arange(len(level)), np.clip(level, 0, self.depth - 1)]
         part = np.where(over, 1.0, 1.0 - state.distance / long)
         goal, everybody = state.goals[0][np.arange(self.trials) >> self.depth], state.endpoint[ends]
-        static = None if state.partner is None else state.partner[ends - 1]
-        if static is not None:
-            everybody = np.column_stack([everybody, static])
+        partner = state.partner
+        if partner is not None:  # at the end of a trial it is already that of the next one
+            everybody = np.column_stack([everybody, partner[ends - 1]])
         there = everybody == goal[:, None]
         shown = {
             "trial": state.trial - over,
@@ -277,9 +277,9 @@ class ExtendedTMaze(AbstractEnvironment):
             "company": trace.observations[ends, :, 1] > 0.0,
             "reward": trace.observations[ends, :, 2] > 0.0,
         }
-        if static is not None:  # at the end of a trial the state has that of the next one
-            shown["partner"] = state.partner[np.maximum(np.arange(len(level)) - over, 0)]
-            shown["static"] = static
+        if partner is not None:
+            before = np.maximum(np.arange(len(level)) - over, 0)
+            shown |= {"static": partner[ends - 1], "partner": partner[before]}
         return shown
 
     def _goals(self, key: PRNGKeyArray) -> Int[Array, " 3"]:

@@ -144,7 +144,7 @@ def _opened(
     """A task with further arguments, and its one copy, opened in this process."""
     kwargs = tuple((dict(task.kwargs) | arguments).items())
     task = replace(task, kwargs=kwargs, in_process=True, tolerated=0.0, at_once=None)
-    copies = None
+    copies: Any = None
     try:
         copies = task.copies(1)
         yield task, copies.here

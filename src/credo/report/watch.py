@@ -64,7 +64,7 @@ def watch(
     output = default if output is None else pathlib.Path(output)
     _check(output, shown is not None, filmed)
     seeds = range(seed, seed + episodes)
-    if output.suffix.lower() == ".html":
+    if shown is not None and output.suffix.lower() == ".html":
         policy = champion(run)
         traces = {f"seed {s}": record(env, policy, key=jax.random.key(s)) for s in seeds}
         title = f"Credo: {run.path.name}"
