@@ -236,7 +236,7 @@ def trace_fleet(
     before = (played.observations[:-1], jax.tree.map(lambda x: x[:-1], played.carries))
     return FleetTrace(
         played.rewards["net"],
-        jnp.asarray(played.active)[:-1],
+        jnp.asarray(played.active),
         jnp.argmax(played.actions, axis=2),
         _writes(policy, *before),
         played.carries.memory[1:],

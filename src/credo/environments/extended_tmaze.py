@@ -261,21 +261,25 @@ class ExtendedTMaze(AbstractEnvironment):
             lengths = np.full((len(level), self.depth), self.corridor[0])
         long = lengths[np.arange(len(level)), np.clip(level, 0, self.depth - 1)]
         part = np.where(over, 1.0, 1.0 - state.distance / long)
-        trials = np.arange(self.trials)
+        goal, everybody = state.goals[0][np.arange(self.trials) >> self.depth], state.endpoint[ends]
+        partner = state.partner
+        if partner is not None:  # at the end of a trial it is already that of the next one
+            everybody = np.column_stack([everybody, partner[ends - 1]])
+        there = everybody == goal[:, None]
         shown = {
             "trial": state.trial - over,
             "level": level,
             "part": part.astype(np.float32),
             "turns": state.endpoint,
-            "goal": state.goals[0][trials >> self.depth],
+            "goal": goal,
             "endpoint": state.endpoint[ends],
-            "observed": trace.rewards["score"][ends - 1] > 0.0,
+            "observed": there.all(axis=1) if self.objective == "converge" else there.any(axis=1),
             "company": trace.observations[ends, :, 1] > 0.0,
             "reward": trace.observations[ends, :, 2] > 0.0,
         }
-        if state.partner is not None:  # at the end of a trial it is already that of the next one
-            shown["partner"] = state.partner[np.maximum(np.arange(len(level)) - over, 0)]
-            shown["static"] = state.partner[ends - 1]
+        if partner is not None:
+            before = np.maximum(np.arange(len(level)) - over, 0)
+            shown |= {"static": partner[ends - 1], "partner": partner[before]}
         return shown
 
     def _goals(self, key: PRNGKeyArray) -> Int[Array, " 3"]:

@@ -212,6 +212,12 @@ class ForeignCopies(AbstractCopies):
         return self._backend
 
     @property
+    def here(self) -> Any:
+        """The environment of the first copy, where it is played in this process, to draw it."""
+        backend = self._opened()
+        return backend._envs[0] if isinstance(backend, worker.Environments) else None
+
+    @property
     def usable(self) -> bool:
         return not self._closed and (self._backend is None or self._backend.usable)
 

@@ -16,10 +16,10 @@ from ..evolution.islands import Islands
 from ..networks.base import AbstractNetwork
 from ..networks.mlp import MLP
 from ..networks.mmu import MMU
-from ..report import maze_page
-from ..report.sections import Curve, Figure, HeatMap, Reference, Table, Text, Tracks
+from ..report import mazes
+from ..report.page import Curve, Figure, HeatMap, Reference, Table, Text, Tracks
 from ..rollout import evaluate
-from ..runs.store import Run
+from ..runs.loop import Run
 from .base import Cell
 
 BUDGETS = ("smoke", "quick", "full", "published")
@@ -156,7 +156,7 @@ def episode(run: int, env: ExtendedTMaze, champion: Any) -> dict[str, Any] | Non
         return None
     trace = maze_trace.trace_maze(env, champion, key=key)
     left_out = {} if env.robots == 1 else {"memory": None}
-    return {"run": run} | maze_page.plain(env, trace) | left_out
+    return {"run": run} | trace.plain(env) | left_out
 
 
 def learned(name: str, runs: list[Run], episodes: int, signal: str, digits: int) -> dict[str, Any]:
@@ -224,7 +224,7 @@ def pictures(measured: dict[str, Any]) -> list[Tracks | HeatMap]:
         picture
         for name, cell in measured.items()
         if cell.get("episode") is not None
-        for picture in maze_page.pictures(
+        for picture in mazes.pictures(
             f"An episode of {name}: run {cell['episode']['run']}, the best of {len(cell['final'])}",
             cell["episode"],
         )

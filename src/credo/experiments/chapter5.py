@@ -15,7 +15,6 @@ from ..algorithms.off_policy import OffPolicy
 from ..algorithms.ppo import PPO
 from ..analysis import attribution, statistics
 from ..environments.gymnasium import Gymnasium, close_all
-from ..environments.wrappers import DelayedHostReward
 from ..environments.wrappers import delayed as with_delay
 from ..networks.exploration import Explorer, GaussianNoise
 from ..networks.mlp import MLP, ResidualCritic
@@ -220,7 +219,7 @@ def outcome(name: str, runs: list[Run], axis: str = "frames") -> dict[str, Any]:
     grid = attribution.axis(xs, POINTS)
     smooth = [statistics.moving_average(score, SMOOTHED) for score in scores]
     updates = [m["updates"].sum() / m["frames"][-1] if "updates" in m else np.nan for m in metrics]
-    floor = random_returns(undelayed(env))
+    floor = random_returns(env.unwrapped)
     close_all()  # simulators of dozens of episodes
     return {
         "task": task_of(env),
@@ -246,13 +245,8 @@ def over(run: Run, metrics: dict[str, np.ndarray], axis: str) -> np.ndarray:
     return metrics[axis]
 
 
-def undelayed(env: Any) -> Any:
-    """The task whose returns are those of `env`: a delay changes when they are paid."""
-    return env.env if isinstance(env, DelayedHostReward) else env
-
-
 def task_of(env: Any) -> str:
-    return undelayed(env).id
+    return env.unwrapped.id
 
 
 def label_of(name: str) -> str:

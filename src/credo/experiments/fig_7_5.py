@@ -2,11 +2,13 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 
-from ..report import replay_page, trajectories
-from ..report.sections import Drawing, Table
-from ..runs.store import Run
+from ..report import trajectories
+from ..report.page import Drawing, Table
+from ..rollout import record
+from ..runs.loop import Run
 from . import chapter7
 from .base import Cell
 from .chapter7 import Plan
@@ -44,12 +46,12 @@ def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
 def _shown(name: str, run: Run) -> dict[str, Any]:
     """One world in full, and the mean of many."""
     env = run.algorithm.env
-    (episode,) = replay_page.play(env, run.champion, [SEED])
+    shown = env.shown(record(env, run.champion, key=jax.random.key(SEED)))
     return {
         **chapter7.outcome(name, [run]),
-        "position": np.round(np.asarray(episode.position, np.float64), 2).tolist(),
-        "poi": np.round(np.asarray(episode.poi, np.float64), 2).tolist(),
-        "observed": np.asarray(episode.observed[-1]).astype(int).tolist(),
+        "position": np.round(np.asarray(shown["position"], np.float64), 2).tolist(),
+        "poi": np.round(np.asarray(shown["poi"], np.float64), 2).tolist(),
+        "observed": np.asarray(shown["observed"][-1]).astype(int).tolist(),
         "activation distance": float(env.activation_distance),
         "size": float(env.size),
     }

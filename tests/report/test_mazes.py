@@ -13,11 +13,10 @@ from credo.environments.extended_tmaze import ExtendedTMaze
 from credo.environments.wrappers import DelayedReward
 from credo.networks.mmu import MMU
 from credo.networks.team import Team
-from credo.report import maze_page
-from credo.report.pages import render
-from credo.report.sections import Page
+from credo.report import mazes
 from credo.report.watch import watch
 from credo.runs import checkpoint, config
+from credo.runs.record import RunError
 from credo.runs.store import Run
 
 ENV = ExtendedTMaze(depth=1, robots=2, objective="spread")
@@ -44,7 +43,7 @@ def trace():
 
 
 def test_plain_numbers_are_those_of_the_trace(trace):
-    episode = maze_page.plain(ENV, trace)
+    episode = trace.plain(ENV)
     assert json.loads(json.dumps(episode)) == episode
     for name in ("goal", "observed", "partner"):
         assert episode[name] == np.asarray(getattr(trace, name)).astype(int).tolist()
@@ -55,7 +54,7 @@ def test_plain_numbers_are_those_of_the_trace(trace):
 
 
 def test_a_picture_and_its_table_show_the_episode(trace):
-    walk, *maps = maze_page.pictures("Seed 0", maze_page.plain(ENV, trace))
+    walk, *maps = mazes.pictures("Seed 0", trace.plain(ENV))
     assert [track.label for track in walk.tracks] == ["robot 1", "robot 2", "static robot"]
     assert [track.scripted for track in walk.tracks] == [False, False, True]
     assert walk.breaks == (2, 4)
@@ -80,12 +79,12 @@ def test_a_picture_and_its_table_show_the_episode(trace):
 
 
 def test_endpoints_are_named_by_their_turns():
-    assert [maze_page.turns(i, 2) for i in range(4)] == ["LL", "LR", "RL", "RR"]
+    assert [mazes.turns(i, 2) for i in range(4)] == ["LL", "LR", "RL", "RR"]
 
 
 def test_without_memory_or_static_robot_there_is_no_picture_of_them(trace):
-    episode = maze_page.plain(ENV, trace) | {"memory": None, "partner": None}
-    (walk,) = maze_page.pictures("Seed 0", episode)
+    episode = trace.plain(ENV) | {"memory": None, "partner": None}
+    (walk,) = mazes.pictures("Seed 0", episode)
     assert [track.label for track in walk.tracks] == ["robot 1", "robot 2"]
 
 
@@ -95,19 +94,21 @@ def test_watch_writes_a_page_of_some_episodes(tmp_path):
     output = watch(run, tmp_path / "new" / "page.html", episodes=2, seed=3)
     assert [child.name for child in output.parent.iterdir()] == ["page.html"]
     html = output.read_text(encoding="utf-8")
-    assert "The champion: 2 robots beside a static one (FSP), 1-deep, Spread." in html
-    assert re.findall(r"<h2>(Seed \d+)</h2>", html) == ["Seed 3", "Seed 4"]
-    for seed in (3, 4):
+    assert "2 robots beside a static one (FSP), 1-deep, Spread: the reward is observed" in html
+    (text,) = re.findall(r'<script type="application/json">(.*?)</script>', html, re.S)
+    shown = json.loads(text)["episodes"]
+    assert [episode["name"] for episode in shown] == ["seed 3", "seed 4"]
+    for seed, episode in zip((3, 4), shown, strict=True):
         played = trace_maze(ENV, champion(), key=jax.random.key(seed))
-        (walk, *_) = maze_page.pictures(f"Seed {seed}", maze_page.plain(ENV, played))
-        (table,) = re.findall(r"<table>.*?</table>", render(Page("", "", "", [walk])), flags=re.S)
-        assert table in html
+        assert episode["endpoint"] == played.endpoint.tolist()
+        assert episode["static"] == played.partner.tolist()
+        assert episode["observed"] == played.observed.astype(int).tolist()
 
 
 def test_what_is_no_page_or_too_deep_is_told(tmp_path):
     run = made(tmp_path / "run")
-    with pytest.raises(ValueError, match=r"film\.gif': of a T-maze it must end in \.html"):
+    with pytest.raises(ValueError, match=r"film\.gif': its name must end in \.html$"):
         watch(run, tmp_path / "film.gif")
-    with pytest.raises(ValueError, match="5-deep: up to 4 a picture shows its 96 trials"):
-        watch(made(tmp_path / "deep", ExtendedTMaze(depth=5)))
+    with pytest.raises(RunError, match=r"T-mazes \(up to 6 deep\)"):
+        watch(made(tmp_path / "deep", ExtendedTMaze(depth=7)))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["deep", "run"]
