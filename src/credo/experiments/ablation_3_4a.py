@@ -9,7 +9,7 @@ import numpy as np
 
 from ..algorithms.neuroevolution import Neuroevolution
 from ..analysis import counting
-from ..evolution.curriculum import Curriculum
+from ..environments.curriculum import Curriculum
 from ..report.page import Curve, Figure, Reference, Table
 from ..runs.loop import Run
 from . import chapter3
