@@ -9,9 +9,9 @@ import numpy as np
 
 from ..algorithms.neuroevolution import Neuroevolution
 from ..analysis import counting
-from ..evolution.curriculum import Curriculum
-from ..report.sections import Curve, Figure, Reference, Table
-from ..runs.store import Run
+from ..environments.curriculum import Curriculum
+from ..report.page import Curve, Figure, Reference, Table
+from ..runs.loop import Run
 from . import chapter3
 from .base import Cell
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from ..algorithms.lineage import MAKERS
 from ..analysis import attribution, floors
 from ..environments.base import AbstractSequenceTask
 from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
-from ..evolution.lineage import MAKERS
 from ..learners.base import AbstractLearner
 from ..runs import config
 from ..runs.record import RunError

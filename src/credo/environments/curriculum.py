@@ -5,20 +5,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .. import require
-from ..environments.base import AbstractEnvironment, AbstractSequenceTask
-from ..environments.host import AbstractHostEnvironment
-from ..environments.wrappers import Shortened
+from .base import AbstractEnvironment, AbstractSequenceTask
+from .host import AbstractHostEnvironment
+from .wrappers import Shortened
 
 
 class Curriculum(eqx.Module):
     """Ask `start` questions per sequence, and one more whenever the best member answers enough
     sequences without a mistake."""
 
-    start: int = eqx.field(static=True, default=3)  # scored steps per sequence at first
+    start: int = eqx.field(static=True, default=3)  # questions per sequence at first, at least 1
     whole: AbstractSequenceTask | None = None
-    """The task at its end; None: the algorithm's own. It may be longer: what is still right at
-    depth 101 is less likely to be right at depth 21 by luck."""
-    threshold: float = 0.9  # share of its sequences that the best must have right, in [0, 1]
+    """The task at the last level; None: the algorithm's own. It may be longer than the task that is
+    tested: what is right at depth 101 is less likely to be right at depth 21 by luck."""
+    threshold: float = 0.9
+    """Share of sequences that the best member must answer without a mistake, in [0, 1]."""
 
     def __check_init__(self):
         require.at_least("start", self.start, 1)

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from credo.environments.curriculum import Curriculum
 from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
-from credo.evolution.curriculum import Curriculum
 
 TASK = SequenceClassification(depth=4, min_gap=1, max_gap=2)
 
