@@ -1,0 +1,309 @@
+"""Views of rows: what a table's columns and a figure's axes are made of.
+
+A view is called with results and published values and gives sections of a page. Which labels make
+the rows of a table, the panels and lines of a figure, is said once; nothing else knows the names of
+cells. A view without rows gives no section.
+
+The content of a table's cell is a function of the rows that belong to its row: `mean`, `each`,
+`count`, `known`, `published`, or one of the experiment's own.
+"""
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..report import sections as page
+from ..report.rows import Label, Labels, Results, Series
+from .base import Value, named
+
+Of = Callable[[Results, Sequence[Value]], page.Cell]  # what a table shows of some rows
+
+
+# ----------------------------------------------------------------------- what a cell of a table has
+
+
+def per_seed(results: Results, metric: str) -> dict[int, float]:
+    """A metric's mean over all rows of each seed (episodes, agents, …); NaN where all are null. Of
+    a series the last point."""
+    found: dict[int, list[float]] = {}
+    for seed, values in results.by_seed(metric).items():
+        if seed is not None:
+            found[seed] = [np.nan if value is None else float(value) for value in values]
+    for curve in results.curves:
+        if curve.metric == metric and curve.seed is not None:
+            last = curve.values[-1]
+            found.setdefault(curve.seed, []).append(np.nan if last is None else float(last))
+    return {seed: float(np.mean(values)) for seed, values in found.items()}
+
+
+def mean(metric: str, scale: float = 1.0, digits: int | None = None, **labels: Any) -> Of:
+    """The mean over runs with its interval, and every run."""
+
+    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        found = per_seed(results.where(**labels), metric)
+        if not any(np.isfinite(list(found.values()))):
+            return None
+        given = [value if np.isfinite(value) else None for value in found.values()]
+        return page.Summary(given, list(found), scale, digits)
+
+    return of
+
+
+def plain_mean(metric: str, scale: float = 1.0, **labels: Any) -> Of:
+    """The mean over runs alone: of budgets and other things that hardly differ."""
+
+    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        found = list(per_seed(results.where(**labels), metric).values())
+        return scale * float(np.mean(found)) if found else None
+
+    return of
+
+
+def each(metric: str, none: str = "never", form: str = ",", **labels: Any) -> Of:
+    """The value of every run, in order; `none`: what a run without one shows."""
+
+    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        found = results.where(**labels).by_seed(metric)
+        told = [x for seed, several in found.items() if seed is not None for x in several]
+        return ", ".join(none if x is None else f"{x:{form}}" for x in told) or None
+
+    return of
+
+
+def count(metric: str, test: Callable[[Any], bool], **labels: Any) -> Of:
+    """How many runs pass a test of a metric: "2 of 3"."""
+
+    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        found = list(per_seed(results.where(**labels), metric).values())
+        return f"{sum(map(test, found))} of {len(found)}" if found else None
+
+    return of
+
+
+def known(metric: str, scale: float = 1.0, **labels: Any) -> Of:
+    """A number of the cell as a whole: a baseline, an upper bound."""
+
+    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        value = results.where(**labels).value(metric)
+        return value if value is None or isinstance(value, str) else scale * value
+
+    return of
+
+
+def published(metric: str, sourced: bool = False) -> Of:
+    """What was published of the cells that these rows belong to; None if nothing was."""
+
+    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        found = [
+            value
+            for value in values
+            if value.metric == metric
+            and any(value.labels.items() <= dict(cell["labels"]).items() for cell in results.cells)
+        ]
+        if not found:
+            return None
+        best = max(found, key=lambda value: len(value.labels))  # the most particular one
+        return f"{best.value} ({best.source})" if sourced else best.value
+
+    return of
+
+
+# ----------------------------------------------------------------------------------------- views
+
+
+@dataclass(frozen=True)
+class Table:
+    """A row of cells for each combination of the labels `rows`; `columns` by their title. `where`:
+    only what has these labels. `titles`: a heading for a label, where its name is not one."""
+
+    title: str
+    rows: Sequence[str]
+    columns: Mapping[str, Of]
+    where: Labels = field(default_factory=dict)
+    titles: Mapping[str, str] = field(default_factory=dict)
+    caption: str = ""
+
+    def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
+        chosen = results.where(**self.where)
+        keys = combinations(chosen, self.rows)
+        body = []
+        for key in keys:
+            here = chosen.where(**dict(zip(self.rows, key, strict=True)))
+            body.append(
+                [*map(label_text, key), *(of(here, values) for of in self.columns.values())]
+            )
+        headings = [self.titles.get(name, name) for name in self.rows] + list(self.columns)
+        # A column that says nothing anywhere, such as a label that no cell has, is left out.
+        kept = [any(row[i] is not None for row in body) for i in range(len(headings))]
+        body = [list(itertools.compress(row, kept)) for row in body]
+        if body:
+            columns = list(itertools.compress(headings, kept))
+            yield page.Table(self.title, columns, body, caption=self.caption)
+
+
+@dataclass(frozen=True)
+class Pivot:
+    """One content `value` over two labels: a row for each level of `rows`, a column for each of
+    `columns`; `beside`: further columns, by their title."""
+
+    title: str
+    value: Of
+    rows: str
+    columns: str
+    beside: Mapping[str, Of] = field(default_factory=dict)
+    where: Labels = field(default_factory=dict)
+    caption: str = ""
+
+    def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
+        chosen = results.where(**self.where)
+        across = [level for (level,) in combinations(chosen, [self.columns]) if level is not None]
+
+        def of(level: Label) -> Of:
+            return lambda found, given: self.value(found.where(**{self.columns: level}), given)
+
+        columns = {str(label_text(level)): of(level) for level in across}
+        table = Table(self.title, [self.rows], columns | dict(self.beside), caption=self.caption)
+        return table(chosen, values)
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Lines over an axis: a figure for each combination of the labels `panel`, a line for each of
+    `line`.
+
+    `y`: a metric. Of a series, `x` is its axis; of rows, `x` is a label with numbers. `levels`:
+    horizontal lines, by their name. `title`: with the panel's labels in it as `{label}`.
+    """
+
+    y: str
+    x: str
+    line: Sequence[str]
+    panel: Sequence[str] = ()
+    title: str = ""
+    y_label: str = ""
+    levels: Mapping[str, Of] = field(default_factory=dict)
+    where: Labels = field(default_factory=dict)
+    scale: float = 1.0
+    log_x: bool = False
+    y_range: tuple[float, float] | None = None
+    caption: str = ""
+
+    def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
+        chosen = of_metric(results.where(**self.where), self.y)
+        for key in combinations(chosen, self.panel):
+            told = dict(zip(self.panel, key, strict=True))
+            here, everything = chosen.where(**told), results.where(**self.where | told)
+            curves = [
+                self.curve(here.where(**line), named(present(line)) or self.y)
+                for found in combinations(here, self.line)
+                for line in [dict(zip(self.line, found, strict=True))]
+            ]
+            title = self.title.format(**told) if self.title else named(present(told))
+            levels = [(name, of(everything, values)) for name, of in self.levels.items()]
+            yield page.Figure(
+                title,
+                self.x,
+                self.y_label or self.y,
+                curves,
+                [page.Reference(name, x) for name, x in levels if isinstance(x, int | float)],
+                self.caption,
+                self.log_x,
+                self.y_range,
+            )
+
+    def curve(self, results: Results, label: str) -> page.Curve:
+        """One line, of every seed."""
+        if results.curves:
+            return page.Curve(
+                label,
+                results.curves[0].at,
+                [[number(y, self.scale) for y in curve.values] for curve in results.curves],
+            )
+        xs = sorted({row.labels[self.x] for row in results.rows})
+        runs = [
+            [per_seed(results.where(**{self.x: x}), self.y).get(seed, np.nan) for x in xs]
+            for seed in dict.fromkeys(row.seed for row in results.rows)
+        ]
+        return page.Curve(label, xs, self.scale * np.array(runs, np.float64))
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """A metric as colours: of series a line for each level of `rows` and a column for each point,
+    of rows two labels. Runs are averaged; `where` picks one. A figure for each of `panel`."""
+
+    metric: str
+    rows: str
+    columns: str
+    panel: Sequence[str] = ()
+    title: str = ""
+    x_label: str = ""
+    y_label: str = ""
+    where: Labels = field(default_factory=dict)
+    caption: str = ""
+
+    def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
+        chosen = of_metric(results.where(**self.where), self.metric)
+        for key in combinations(chosen, self.panel):
+            told = dict(zip(self.panel, key, strict=True))
+            here = chosen.where(**told)
+            dims = [self.rows, "seed"] if here.curves else [self.rows, self.columns, "seed"]
+            array = here.array(self.metric, *dims).astype(np.float64)
+            array = array.mean(axis=dims.index("seed"))
+            columns = here.curves[0].at if here.curves else here.levels(self.columns)
+            yield page.HeatMap(
+                self.title.format(**told) if self.title else named(present(told)),
+                array,
+                [str(label_text(x)) for x in here.levels(self.rows)],
+                [str(label_text(x)) for x in columns],
+                self.x_label or self.columns,
+                self.y_label or self.rows,
+                self.caption,
+            )
+
+
+# --------------------------------------------------------------------------------------- helpers
+
+
+def combinations(results: Results, names: Sequence[str]) -> list[tuple[Any, ...]]:
+    """What these labels are together, in order of appearance; None where a cell has none of the
+    name. Without names, one combination of none if there is anything at all."""
+    every: list[Labels] = [cell["labels"] for cell in results.cells]
+    every = [item.labels for item in [*results.rows, *results.curves]] or every
+    found = dict.fromkeys(tuple(labels.get(name) for name in names) for labels in every)
+    return [key for key in found if not names or any(x is not None for x in key)]
+
+
+def of_metric(results: Results, metric: str) -> Results:
+    """Only the rows and series of a metric."""
+    return Results(
+        results.experiment,
+        results.budget,
+        results.command,
+        results.cells,
+        [row for row in results.rows if row.metric == metric],
+        [curve for curve in results.curves if curve.metric == metric],
+    )
+
+
+def present(labels: Mapping[str, Any]) -> dict[str, Label]:
+    return {name: value for name, value in labels.items() if value is not None}
+
+
+def label_text(value: Any) -> page.Cell:
+    """A label in a table or beside a heat map."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:g}" if isinstance(value, float) else value
+
+
+def number(value: Any, scale: float = 1.0) -> float:
+    return np.nan if value is None else scale * float(value)
+
+
+def rows_of(results: Results, metric: str) -> Sequence[Series]:
+    """The series of a metric."""
+    return [curve for curve in results.curves if curve.metric == metric]
