@@ -1,8 +1,43 @@
 """An experiment is data: cells of runs, what is measured of them, and how rows are shown.
 
-A module of this folder defines one figure or table as `EXPERIMENT`. A cell has labels, an
-algorithm, a budget and seeds; its name and folder are made of its labels, and nothing is ever read
-back from a name. What is measured are rows (`credo.report.rows`), a figure is a view of rows.
+A module of this folder defines one figure or table as `EXPERIMENT`; `catalogue` has its id and its
+title. A cell has labels, an algorithm, a budget and seeds; its name and folder are made of its
+labels, and nothing is ever read back from a name. What is measured are rows
+(`credo.report.rows`), a figure is a view of rows (`views`). A whole module:
+
+    '''Figure 9.1: TD3 and ERL on a pendulum, at two sizes of their networks.'''
+
+    from ..algorithms.erl import ERL
+    from ..algorithms.off_policy import OffPolicy
+    from ..environments.gymnasium import Gymnasium
+    from ..networks.mlp import MLP
+    from . import measures
+    from .base import Cell, Experiment, Value, grid
+    from .views import Curves, Table, known, mean, published
+
+    METHODS = {"td3": OffPolicy.td3, "erl": ERL.erl}
+    FRAMES = {"smoke": 2_000, "quick": 20_000, "full": 200_000}
+
+
+    def cells(budget: str) -> list[Cell]:
+        return [
+            Cell(x, METHODS[x["method"]](Gymnasium("Pendulum-v1"), MLP(hidden=(x["width"],))),
+                 seeds=range(3), frames=FRAMES[budget])
+            for x in grid(method=METHODS, width=(16, 64))
+        ]
+
+
+    EXPERIMENT = Experiment(
+        published="Figure 9.1: ERL is better at either size.",
+        cells=cells,
+        measures=(measures.final(), measures.scores(), measures.of_task(measures.random_actions)),
+        views=(
+            Curves("test score", "frames", line=["method"], panel=["width"]),
+            Table("Return", ["width", "method"], {"random": known("random"),
+                  "published": published("return"), "final champion": mean("return")}),
+        ),
+        values=(Value(-150.0, "return", "its text", {"method": "erl", "width": 64}),),
+    )
 """
 
 import importlib
@@ -23,7 +58,7 @@ from .. import tree
 from ..report.page import write as write_page
 from ..report.rows import Label, Labels, Results, Row, Series, concat, read, write
 from ..report.sections import Page, Section
-from ..runs import config, executor
+from ..runs import config, executor, log
 from ..runs.loop import Run
 from ..runs.record import RunError
 from . import catalogue
@@ -66,8 +101,8 @@ class Cell:
     def record(self) -> dict[str, Any]:
         """As `results.json` has it."""
         algorithm = json.loads(json.dumps(config.to_tree(self.algorithm)))
-        budget = {"seeds": list(self.seeds), "budget": self.budget}
-        return {"labels": dict(self.labels), **budget, "algorithm": algorithm}
+        told = {"labels": dict(self.labels), "seeds": list(self.seeds), "budget": self.budget}
+        return told | {"algorithm": algorithm}
 
 
 @dataclass(frozen=True)
@@ -95,6 +130,12 @@ class Trained:
         """The final champions as one population `[runs, …]`."""
         return tree.stack(*(run.champion for run in self.runs))
 
+    def record(self) -> dict[str, Any]:
+        """The cell as `results.json` has it, with the core-hours that its runs took."""
+        clocks = [log.read(run.path / log.TIMING) for run in self.runs]
+        hours = sum(float(clock["seconds"][-1]) for clock in clocks if clock) / 3600
+        return self.cell.record() | {"machine": config.machine(), "hours": round(hours, 2)}
+
 
 Measure = Callable[[Trained], Iterable[Row | Series]]
 
@@ -102,12 +143,13 @@ Measure = Callable[[Trained], Iterable[Row | Series]]
 @dataclass(frozen=True)
 class Value:
     """A published number (or its words: "> 80"), and where it stands. It belongs to every row
-    that has these labels."""
+    that has these labels. `spread`: what stands behind the number: "± 512"."""
 
     value: float | str
     metric: str
     source: str
     labels: Labels = field(default_factory=dict)
+    spread: str = ""
 
 
 View = Section | Callable[[Results, Sequence[Value]], Iterable[Section]]
@@ -131,13 +173,15 @@ class Experiment:
 
 
 def named(labels: Labels) -> str:
-    """Labels in words: words as they are, numbers behind the name of their label."""
-    words = [
-        value if isinstance(value, str) else name if value is True else f"{name} {value}"
-        for name, value in labels.items()
-        if value is not False
-    ]
-    return ", ".join(words)
+    """Labels in words: words as they are, numbers behind the name of their label, of truths the
+    name alone: "merl, coupling 4, delayed"."""
+
+    def words(name: str, value: Label) -> str:
+        if isinstance(value, str) or value is True:
+            return name if value is True else value
+        return f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
+
+    return ", ".join(words(name, x) for name, x in labels.items() if x is not False)
 
 
 def grid(**axes: Iterable[Label]) -> list[dict[str, Label]]:
@@ -181,26 +225,25 @@ def reproduce(
         chosen = [replace(c, seeds=range(c.seeds[0], c.seeds[0] + runs)) for c in chosen]
     target = output / name / budget / "results.json"
     earlier = None if only is None else kept(target, every, chosen)
-    finished = _trained(chosen, budget, work / budget, jobs, f"{name} {budget}")
+    finished = trained(chosen, budget, work / budget, jobs, f"{name} {budget}")
     print(f"{name} {budget}: runs are done; measuring", file=sys.stderr)
-    machine = config.machine()
+    flags = {"--budget": budget, "--runs": runs, "--only": only}
+    told = [f"{x} {shlex.quote(str(given))}" for x, given in flags.items() if given is not None]
+    command = " ".join([f"credo reproduce {name}", *told])
     found, curves = concat(m(cell) for cell in finished for m in experiment.measures)
-    command = f"credo reproduce {name} --budget {budget}"
-    command += f" --runs {runs}" if runs is not None else ""
-    command += f" --only {shlex.quote(only)}" if only is not None else ""
-    cells = [cell.record() | {"machine": machine} for cell in chosen]
-    results = Results(name, budget, command, cells, found, curves)
+    records = [cell.record() for cell in finished]
+    results = Results(name, budget, command, records, found, curves)
     write(results if earlier is None else merged(earlier, results, every), target)
     return page(target)
 
 
-def _trained(
+def trained(
     cells: list[Cell], budget: str, work: pathlib.Path, jobs: int | None, title: str
 ) -> list[Trained]:
-    """Train what is missing of the cells' runs."""
+    """The cells with their runs, in folders of `work`; what is missing of them is trained."""
     paths = [[work / cell.folder / str(seed) for seed in cell.seeds] for cell in cells]
     wanted = [
-        executor.Job(path, cell.algorithm, seed=seed, **({"generations": None} | cell.budget))
+        executor.Job(path, cell.algorithm, cell.generations, seed, cell.frames, None, cell.stop_at)
         for cell, folders in zip(cells, paths, strict=True)
         for seed, path in zip(cell.seeds, folders, strict=True)
     ]
@@ -233,23 +276,21 @@ def kept(path: pathlib.Path, every: list[Cell], chosen: list[Cell]) -> Results |
     try:
         earlier = read(path)
     except ValueError as error:
-        raise RunError(f"{error}: move it away, or choose another --output") from error
-    now = {named(cell.labels) for cell in chosen}
-    known = {cell.name: cell for cell in every}
-    stay = []
-    for record in earlier.cells:
-        name = named(record["labels"])
-        if name in now:
-            continue
-        why = _other_runs(record, known.get(name))
-        if why:
-            print(f"not kept of {path}: {name} ({'; '.join(why)})", file=sys.stderr)
-        else:
-            stay.append(record)
+        raise RunError(
+            f"{error}: convert it by tools/convert_results.py if an older version of Credo wrote "
+            "it; otherwise move it away, or choose another --output"
+        ) from error
+    now, known = {cell.name for cell in chosen}, {cell.name: cell for cell in every}
+    others = {named(x["labels"]): x for x in earlier.cells if named(x["labels"]) not in now}
+    why = {name: _other_runs(record, known.get(name)) for name, record in others.items()}
+    for name, lines in why.items():
+        if lines:
+            print(f"not kept of {path}: {name} ({'; '.join(lines)})", file=sys.stderr)
+    stay = {name: record for name, record in others.items() if not why[name]}
     if not stay:
         return None
-    print(f"kept of {path}: {'; '.join(named(r['labels']) for r in stay)}", file=sys.stderr)
-    return _of_cells(earlier, stay)
+    print(f"kept of {path}: {'; '.join(stay)}", file=sys.stderr)
+    return _of_cells(earlier, list(stay.values()))
 
 
 def _other_runs(record: Mapping[str, Any], cell: Cell | None) -> list[str]:

@@ -4,19 +4,19 @@ A view is called with results and published values and gives sections of a page.
 the rows of a table, the panels and lines of a figure, is said once; nothing else knows the names of
 cells. A view without rows gives no section.
 
-The content of a table's cell is a function of the rows that belong to its row: `mean`, `each`,
-`count`, `known`, `published`, or one of the experiment's own.
+The content of a table's cell is a function of the rows that belong to its row: `mean`, `plain`,
+`each`, `count`, `known`, `published`, or one of the experiment's own.
 """
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ..report import sections as page
-from ..report.rows import Label, Labels, Results, Series
+from ..report.rows import Label, Labels, Results
 from .base import Value, named
 
 Of = Callable[[Results, Sequence[Value]], page.Cell]  # what a table shows of some rows
@@ -52,14 +52,14 @@ def mean(metric: str, scale: float = 1.0, digits: int | None = None, **labels: A
     return of
 
 
-def plain_mean(metric: str, scale: float = 1.0, **labels: Any) -> Of:
-    """The mean over runs alone: of budgets and other things that hardly differ."""
+def plain(metric: str, scale: float = 1.0, of: Callable[[Any], Any] = np.mean, **labels: Any) -> Of:
+    """The mean over runs alone, or their median (`of=np.median`), without interval and runs."""
 
-    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+    def content(results: Results, values: Sequence[Value]) -> page.Cell:
         found = list(per_seed(results.where(**labels), metric).values())
-        return scale * float(np.mean(found)) if found else None
+        return scale * float(of(found)) if found else None
 
-    return of
+    return content
 
 
 def each(metric: str, none: str = "never", form: str = ",", **labels: Any) -> Of:
@@ -84,29 +84,40 @@ def count(metric: str, test: Callable[[Any], bool], **labels: Any) -> Of:
 
 
 def known(metric: str, scale: float = 1.0, **labels: Any) -> Of:
-    """A number of the cell as a whole: a baseline, an upper bound."""
+    """A number of the task rather than of a run: a baseline, an upper bound. Of several cells (a
+    figure's level) the first one's: machines differ in the last digit."""
 
     def of(results: Results, values: Sequence[Value]) -> page.Cell:
-        value = results.where(**labels).value(metric)
+        found = (row for row in results.where(**labels).rows if row.metric == metric)
+        value = next((row.value for row in found), None)
         return value if value is None or isinstance(value, str) else scale * value
 
     return of
 
 
-def published(metric: str, sourced: bool = False) -> Of:
-    """What was published of the cells that these rows belong to; None if nothing was."""
+def published(metric: str, sourced: bool = False, number: bool = False, **labels: Any) -> Of:
+    """What was published of these rows, the most particular first; None if nothing was.
+    `sourced`: with its source. `number`: without its spread, for a figure's level."""
 
     def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        chosen = results.where(**labels)
+        every: list[Labels] = [item.labels for item in [*chosen.rows, *chosen.curves]]
         found = [
             value
             for value in values
             if value.metric == metric
-            and any(value.labels.items() <= dict(cell["labels"]).items() for cell in results.cells)
+            and not (number and isinstance(value.value, str))
+            and any(value.labels.items() <= told.items() for told in every)
         ]
         if not found:
             return None
-        best = max(found, key=lambda value: len(value.labels))  # the most particular one
-        return f"{best.value} ({best.source})" if sourced else best.value
+        best = max(found, key=lambda value: len(value.labels))
+        if number or not (best.spread or sourced):
+            return best.value
+        text = best.value if isinstance(best.value, str) else f"{best.value:,.6g}"
+        return " ".join([text, best.spread][: 2 if best.spread else 1]) + (
+            f" ({best.source})" if sourced else ""
+        )
 
     return of
 
@@ -128,13 +139,12 @@ class Table:
 
     def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
         chosen = results.where(**self.where)
-        keys = combinations(chosen, self.rows)
         body = []
-        for key in keys:
+        for key in combinations(chosen, self.rows):
             here = chosen.where(**dict(zip(self.rows, key, strict=True)))
-            body.append(
-                [*map(label_text, key), *(of(here, values) for of in self.columns.values())]
-            )
+            contents = [of(here, values) for of in self.columns.values()]
+            if any(content is not None for content in contents):
+                body.append([*map(label_text, key), *contents])
         headings = [self.titles.get(name, name) for name in self.rows] + list(self.columns)
         # A column that says nothing anywhere, such as a label that no cell has, is left out.
         kept = [any(row[i] is not None for row in body) for i in range(len(headings))]
@@ -175,14 +185,15 @@ class Curves:
     `line`.
 
     `y`: a metric. Of a series, `x` is its axis; of rows, `x` is a label with numbers. `levels`:
-    horizontal lines, by their name. `title`: with the panel's labels in it as `{label}`.
+    horizontal lines, by their name. `title`: with the panel's labels in it as `{label}`, or all of
+    them as `{panel}`.
     """
 
     y: str
     x: str
     line: Sequence[str]
     panel: Sequence[str] = ()
-    title: str = ""
+    title: str = "{panel}"
     y_label: str = ""
     levels: Mapping[str, Of] = field(default_factory=dict)
     where: Labels = field(default_factory=dict)
@@ -195,13 +206,13 @@ class Curves:
         chosen = of_metric(results.where(**self.where), self.y)
         for key in combinations(chosen, self.panel):
             told = dict(zip(self.panel, key, strict=True))
-            here, everything = chosen.where(**told), results.where(**self.where | told)
+            here, everything = chosen.where(**told), results.where(**{**self.where, **told})
             curves = [
                 self.curve(here.where(**line), named(present(line)) or self.y)
                 for found in combinations(here, self.line)
                 for line in [dict(zip(self.line, found, strict=True))]
             ]
-            title = self.title.format(**told) if self.title else named(present(told))
+            title = titled(self.title, told)
             levels = [(name, of(everything, values)) for name, of in self.levels.items()]
             yield page.Figure(
                 title,
@@ -223,10 +234,9 @@ class Curves:
                 [[number(y, self.scale) for y in curve.values] for curve in results.curves],
             )
         xs = sorted({row.labels[self.x] for row in results.rows})
-        runs = [
-            [per_seed(results.where(**{self.x: x}), self.y).get(seed, np.nan) for x in xs]
-            for seed in dict.fromkeys(row.seed for row in results.rows)
-        ]
+        found = [per_seed(results.where(**{self.x: x}), self.y) for x in xs]
+        seeds = dict.fromkeys(seed for place in found for seed in place)
+        runs = [[place.get(seed, np.nan) for place in found] for seed in seeds]
         return page.Curve(label, xs, self.scale * np.array(runs, np.float64))
 
 
@@ -239,7 +249,7 @@ class HeatMap:
     rows: str
     columns: str
     panel: Sequence[str] = ()
-    title: str = ""
+    title: str = "{panel}"
     x_label: str = ""
     y_label: str = ""
     where: Labels = field(default_factory=dict)
@@ -255,7 +265,7 @@ class HeatMap:
             array = array.mean(axis=dims.index("seed"))
             columns = here.curves[0].at if here.curves else here.levels(self.columns)
             yield page.HeatMap(
-                self.title.format(**told) if self.title else named(present(told)),
+                titled(self.title, told),
                 array,
                 [str(label_text(x)) for x in here.levels(self.rows)],
                 [str(label_text(x)) for x in columns],
@@ -263,6 +273,24 @@ class HeatMap:
                 self.y_label or self.rows,
                 self.caption,
             )
+
+
+@dataclass(frozen=True)
+class Notes:
+    """What to know before comparing. A paragraph may be a function of the results, and may have
+    nothing to say (None)."""
+
+    paragraphs: Sequence[str | Callable[[Results], str | None]]
+    title: str = "How to read it"
+
+    def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
+        told = [text if isinstance(text, str) else text(results) for text in self.paragraphs]
+        yield page.Text(self.title, [text for text in told if text is not None])
+
+
+def where(text: str, **labels: Any) -> Callable[[Results], str | None]:
+    """A paragraph that stands only on pages with such cells."""
+    return lambda results: text if results.where(**labels).cells else None
 
 
 # --------------------------------------------------------------------------------------- helpers
@@ -279,14 +307,16 @@ def combinations(results: Results, names: Sequence[str]) -> list[tuple[Any, ...]
 
 def of_metric(results: Results, metric: str) -> Results:
     """Only the rows and series of a metric."""
-    return Results(
-        results.experiment,
-        results.budget,
-        results.command,
-        results.cells,
-        [row for row in results.rows if row.metric == metric],
-        [curve for curve in results.curves if curve.metric == metric],
-    )
+
+    def chosen(items: Sequence[Any]) -> list[Any]:
+        return [item for item in items if item.metric == metric]
+
+    return replace(results, rows=chosen(results.rows), curves=chosen(results.curves))
+
+
+def titled(title: str, panel: Mapping[str, Any]) -> str:
+    """A title with the labels of its panel."""
+    return title.format(panel=named(present(panel)), **panel)
 
 
 def present(labels: Mapping[str, Any]) -> dict[str, Label]:
@@ -302,8 +332,3 @@ def label_text(value: Any) -> page.Cell:
 
 def number(value: Any, scale: float = 1.0) -> float:
     return np.nan if value is None else scale * float(value)
-
-
-def rows_of(results: Results, metric: str) -> Sequence[Series]:
-    """The series of a metric."""
-    return [curve for curve in results.curves if curve.metric == metric]
