@@ -2,7 +2,7 @@
 budgets, measurements, the table of scores, and what to know before comparing."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -166,17 +166,18 @@ TESTS = (measures.last_tests, measures.effort, measures.of_task(measures.random_
 MEASURES = (measures.final(), measures.scores(), *TESTS)
 
 
-def curves(
-    levels: dict[str, Of] | None = None, x: str = "frames", panel: Sequence[str] = ("task",)
-) -> Curves:
+VARIANTS = ("method", "gamma", "exploration", "manager")  # what lines and rows differ in
+
+
+def curves(**levels: Of) -> Curves:
     """The champions' tests as they were logged, a figure for each task."""
     return Curves(
         "test score",
-        x,
-        ["method", "gamma", "exploration"],
-        panel,
+        "frames",
+        VARIANTS,
+        ["task"],
         y_label="return of the champion",
-        levels={"random policy": known("random")} | (levels or {}),
+        levels={"random policy": known("random")} | levels,
     )
 
 
@@ -186,7 +187,7 @@ def table(caption: str = "", references: bool = True) -> Table:
     others = (*OTHERS, "upper bound") if references else ("upper bound",)
     return Table(
         "Return",
-        ["task", "delayed", "method", "gamma", "exploration"],
+        ["task", "delayed", *VARIANTS],
         {
             "random policy": known("random"),
             "published": published("return"),

@@ -202,12 +202,12 @@ EXPERIMENT = Experiment(
         curves("coupling", "dynamics"),
         notes(
             "Published: the author's logs, of his dynamics, in which every rover drives at half "
-            "the speed whatever it says, with γ 0.5 for MERL and 0.97 for the baselines. His sensors "
-            "show 1/d², up to 10^6: our critics of rectified units diverge on them, his had tanh. "
-            "The dissertation's budget is 2M frames, the budget `published` here. The local reward "
-            "is progress towards the closest POI that is left; with the dissertation's, the "
-            "distance to the closest POI, see docs/merl.md. Its figures have means and 95 % "
-            "intervals of five runs.",
+            "the speed whatever it says, with γ 0.5 for MERL and 0.97 for the baselines. His "
+            "sensors show 1/d², up to 10^6: our critics of rectified units diverge on them, his "
+            "had tanh. The dissertation's budget is 2M frames, the budget `published` here. The "
+            "local reward is progress towards the closest POI that is left; with the "
+            "dissertation's, the distance to the closest POI, see docs/merl.md. Its figures have "
+            "means and 95 % intervals of five runs.",
         ),
     ),
 )

@@ -133,7 +133,7 @@ class Table:
     title: str
     rows: Sequence[str]
     columns: Mapping[str, Of]
-    where: Labels = field(default_factory=dict)
+    where: Mapping[str, Any] = field(default_factory=dict)
     titles: Mapping[str, str] = field(default_factory=dict)
     caption: str = ""
 
@@ -164,7 +164,7 @@ class Pivot:
     rows: str
     columns: str
     beside: Mapping[str, Of] = field(default_factory=dict)
-    where: Labels = field(default_factory=dict)
+    where: Mapping[str, Any] = field(default_factory=dict)
     caption: str = ""
 
     def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
@@ -196,7 +196,7 @@ class Curves:
     title: str = "{panel}"
     y_label: str = ""
     levels: Mapping[str, Of] = field(default_factory=dict)
-    where: Labels = field(default_factory=dict)
+    where: Mapping[str, Any] = field(default_factory=dict)
     scale: float = 1.0
     log_x: bool = False
     y_range: tuple[float, float] | None = None
@@ -252,7 +252,7 @@ class HeatMap:
     title: str = "{panel}"
     x_label: str = ""
     y_label: str = ""
-    where: Labels = field(default_factory=dict)
+    where: Mapping[str, Any] = field(default_factory=dict)
     caption: str = ""
 
     def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
