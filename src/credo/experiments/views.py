@@ -101,7 +101,8 @@ def published(metric: str, sourced: bool = False, number: bool = False, **labels
 
     def of(results: Results, values: Sequence[Value]) -> page.Cell:
         chosen = results.where(**labels)
-        every: list[Labels] = [item.labels for item in [*chosen.rows, *chosen.curves]]
+        every = [cell["labels"] for cell in chosen.cells]
+        every += [item.labels for item in [*chosen.rows, *chosen.curves]]
         found = [
             value
             for value in values
@@ -122,7 +123,79 @@ def published(metric: str, sourced: bool = False, number: bool = False, **labels
     return of
 
 
+def computed(metric: str, function: Callable[[np.ndarray], page.Cell], **labels: Any) -> Of:
+    """What a function makes of a metric's values `[seeds, values of each]`; of a series the last
+    point counts."""
+
+    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        chosen = results.where(**labels)
+        every = {seed: x for seed, x in chosen.by_seed(metric).items() if seed is not None}
+        every = every or {seed: [x] for seed, x in per_seed(chosen, metric).items()}
+        return function(np.array(list(every.values()), np.float64)) if every else None
+
+    return of
+
+
+def median(metric: str, scale: float = 1.0, **labels: Any) -> Of:
+    """Median and range over runs; of one run just its value."""
+
+    def told(x: np.ndarray) -> page.Cell:
+        x = scale * np.mean(x, axis=1)
+        x = x[np.isfinite(x)]
+        if x.size < 2:
+            return f"{x[0]:.1f}" if x.size else None
+        return f"{np.median(x):.1f} ({x.min():.1f}…{x.max():.1f})"
+
+    return computed(metric, told, **labels)
+
+
+def at(x: float, content: Of) -> Of:
+    """What a content is of series that end at `x`; None if no series has a point there."""
+
+    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        curves = [
+            curve._replace(at=curve.at[: i + 1], values=curve.values[: i + 1])
+            for curve in results.curves
+            for i in [list(curve.at).index(x) if x in curve.at else None]
+            if i is not None
+        ]
+        return content(replace(results, curves=curves), values)
+
+    return of
+
+
+def constant(value: float | str) -> Of:
+    """The same for all: a published level, an upper bound."""
+    return lambda results, values: value
+
+
 # ----------------------------------------------------------------------------------------- views
+
+
+@dataclass(frozen=True)
+class Runs:
+    """A row for each run, in order of the seeds; a table for each combination of `panel`, which
+    `{panel}` in the title tells."""
+
+    title: str
+    columns: Mapping[str, Of]
+    panel: Sequence[str] = ()
+    where: Labels = field(default_factory=dict)
+    caption: str = ""
+
+    def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
+        chosen = results.where(**self.where)
+        for key in combinations(chosen, self.panel):
+            told = dict(zip(self.panel, key, strict=True))
+            here = chosen.where(**told)
+            body = [
+                [str(seed), *(of(of_seed(here, seed), values) for of in self.columns.values())]
+                for seed in dict.fromkeys(x.seed for x in [*here.rows, *here.curves])
+                if seed is not None
+            ]
+            title = self.title.format(panel=named(present(told)))
+            if body:
+                yield page.Table(title, ["seed", *self.columns], body, caption=self.caption)
 
 
 @dataclass(frozen=True)
@@ -186,7 +259,7 @@ class Curves:
 
     `y`: a metric. Of a series, `x` is its axis; of rows, `x` is a label with numbers. `levels`:
     horizontal lines, by their name. `title`: with the panel's labels in it as `{label}`, or all of
-    them as `{panel}`.
+    them as `{panel}`. A line is named by those of its labels that not all lines of its panel share.
     """
 
     y: str
@@ -207,10 +280,10 @@ class Curves:
         for key in combinations(chosen, self.panel):
             told = dict(zip(self.panel, key, strict=True))
             here, everything = chosen.where(**told), results.where(**{**self.where, **told})
+            lines = [dict(zip(self.line, x, strict=True)) for x in combinations(here, self.line)]
             curves = [
-                self.curve(here.where(**line), named(present(line)) or self.y)
-                for found in combinations(here, self.line)
-                for line in [dict(zip(self.line, found, strict=True))]
+                self.curve(here.where(**line), words or self.y)
+                for line, words in zip(lines, differing(lines), strict=True)
             ]
             title = titled(self.title, told)
             levels = [(name, of(everything, values)) for name, of in self.levels.items()]
@@ -307,16 +380,33 @@ def combinations(results: Results, names: Sequence[str]) -> list[tuple[Any, ...]
 
 def of_metric(results: Results, metric: str) -> Results:
     """Only the rows and series of a metric."""
+    return only(results, lambda item: item.metric == metric)
 
-    def chosen(items: Sequence[Any]) -> list[Any]:
-        return [item for item in items if item.metric == metric]
 
-    return replace(results, rows=chosen(results.rows), curves=chosen(results.curves))
+def of_seed(results: Results, seed: int | None) -> Results:
+    """Only the rows and series of one run."""
+    return only(results, lambda item: item.seed == seed)
+
+
+def only(results: Results, test: Callable[[Any], bool]) -> Results:
+    """Only the rows and series that pass a test."""
+    rows, curves = ([x for x in items if test(x)] for items in (results.rows, results.curves))
+    return replace(results, rows=rows, curves=curves)
 
 
 def titled(title: str, panel: Mapping[str, Any]) -> str:
     """A title with the labels of its panel."""
     return title.format(panel=named(present(panel)), **panel)
+
+
+def differing(lines: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Of each line, in words, the labels that tell it from the others; all of them if there is
+    nothing else to say."""
+    told = [name for name in lines[0] if len({line[name] for line in lines}) > 1]
+    return [
+        named(present({name: line[name] for name in told})) or named(present(line))
+        for line in lines
+    ]
 
 
 def present(labels: Mapping[str, Any]) -> dict[str, Label]:
