@@ -97,11 +97,12 @@ def published(metric: str, sourced: bool = False) -> Of:
     """What was published of the cells that these rows belong to; None if nothing was."""
 
     def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        told = [cell["labels"].items() for cell in results.cells]
+        told += [row.labels.items() for row in results.rows]
         found = [
             value
             for value in values
-            if value.metric == metric
-            and any(value.labels.items() <= dict(cell["labels"]).items() for cell in results.cells)
+            if value.metric == metric and any(value.labels.items() <= labels for labels in told)
         ]
         if not found:
             return None
@@ -135,6 +136,11 @@ def median(metric: str, scale: float = 1.0, **labels: Any) -> Of:
         return f"{np.median(x):.1f} ({x.min():.1f}…{x.max():.1f})"
 
     return computed(metric, told, **labels)
+
+
+def best(metric: str, scale: float = 1.0) -> Of:
+    """The best of all runs."""
+    return computed(metric, lambda x: f"{scale * np.nanmax(np.mean(x, axis=1)):.1f}")
 
 
 def at(x: float, content: Of) -> Of:
