@@ -18,7 +18,7 @@ Found = Iterator[Row | Series]
 Labels = dict[str, Any]
 
 # Keys of old measurements whose leaves are axes and labels now, not values.
-AXES = {"generation", "instances", "gaps", "depths", "depth", "permutations", "sums", "needed"}
+AXES = {"generation", "instances", "gaps", "depths", "depth", "permutations", "sums"}
 AXES |= {"rows", "noise", "cell", "where", "network"}
 
 
@@ -69,6 +69,7 @@ def results(
 ) -> Results:
     """A record whose measurements are by cell or, `together`, of its only cell. Asserts that
     nothing of them is left over."""
+    prune(old["measured"])
     measured = copy.deepcopy(old["measured"])
     cells, parts = [], []
     for name, cell in old["cells"].items():
@@ -87,6 +88,17 @@ def results(
     assert not measured, list(measured)
     found, curves = concat(parts)
     return Results(old["experiment"], old["budget"], old["command"], cells, found, curves)
+
+
+def prune(measured: dict[str, Any]) -> None:
+    """Take out what says nothing: parts of an episode that are null, and the number of a memory
+    cell, which is its place in the list."""
+    for cell in measured.values():
+        if isinstance(cell, dict) and "episode" in cell:
+            kept = {k: x for k, x in (cell.pop("episode") or {}).items() if x is not None}
+            cell |= {"episode": kept} if kept else {}
+    for cells in measured.get("roles", []):
+        assert [role.pop("cell") for role in cells] == list(range(len(cells)))
 
 
 # -------------------------------------------------------------------------------------- chapter 3
@@ -161,9 +173,8 @@ def memory(cell: dict[str, Any], labels: Labels, seeds: list[int]) -> Found:
             yield from rows("memory", [final], here, seed=[seed], cell=cells)
             yield from rows("signature", [signature], here, seed=[seed], rank=None)
             yield Row(here, seed, "right", right)
-        needed = run.pop("needed")
-        yield from rows("needed", [[i in needed for i in range(len(cells))]], **told, cell=cells)
-        yield from rows("cost of masking", [run.pop("masking costs")], **told, cell=cells)
+        yield from rows("needed", [run.pop("needed")], **told, rank=None)
+        yield from rows("masking costs", [run.pop("masking costs")], **told, cell=cells)
         for metric in ("spread within equal sums", "signature predicts class"):
             yield from rows(metric, [run.pop(metric)], **told)
         assert not run
@@ -175,9 +186,13 @@ def counting(cell: dict[str, Any], labels: Labels, seeds: list[int]) -> Found:
     yield from rows("signals fed", cell.pop("fed"), labels, sign=signs)
     final = cell.pop("memory")
     told: dict[str, Any] = {"seed": seeds, "cell": memory_cells(len(final[0][0]))}
-    for i, (minus, plus) in enumerate(cell.pop("rows")):
-        here = {**labels, "negatives": minus, "positives": plus}
-        yield from rows("memory", [run[i] for run in final], here, **told)
+    by_cell = [[list(x) for x in zip(*run, strict=True)] for run in final]
+    fed = cell.pop("rows")
+    first = sum(plus == 0 for _, plus in fed)
+    for i, (sign, part) in enumerate(zip(signs, (slice(first), slice(first, None)), strict=True)):
+        at, here = [both[i] for both in fed[part]], {**labels, "sign": sign}
+        memory = [[values[part] for values in run] for run in by_cell]
+        yield from series("memory", "signals of this sign", at, memory, here, **told)
     counted = [[list(x) for x in zip(*run, strict=True)] for run in cell.pop("counted")]
     yield from rows("signals counted", counted, labels, **told, sign=signs)
     right = cell.pop("random signals right")
@@ -202,7 +217,7 @@ def roles(cell: dict[str, Any], labels: Labels, seeds: list[int]) -> Found:
     yield Row(labels, None, "algorithm", cell.pop("algorithm"))
     for seed, cells in zip(seeds, cell.pop("roles"), strict=True):
         for role in cells:
-            here = {**labels, "cell": f"M{role.pop('cell') + 1}"}
+            here = {**labels, "cell": memory_cells(len(cells))[cells.index(role)]}
             yield from (Row(here, seed, METRICS[k], role.pop(k)) for k in METRICS)
             assert not role
 
@@ -242,12 +257,11 @@ def episode(played: dict[str, Any], labels: Labels, seeds: list[int]) -> Found:
     at = range(1, len(played["goal"]) + 1)
     robots = range(1, len(played["endpoint"]) + 1)
     for metric in ("goal", "observed", "partner"):
-        values = played.pop(metric)
-        if values is not None:
-            yield from series(metric, "trial", at, [values], **told)
+        if metric in played:
+            yield from series(metric, "trial", at, [played.pop(metric)], **told)
     for metric in ("endpoint", "company", "reward"):
         yield from series(metric, "trial", at, [played.pop(metric)], **told, robot=robots)
-    held = played.pop("memory")
+    held = played.pop("memory", None)
     if held is not None:
         axes: dict[str, Any] = {"robot": robots, "cell": memory_cells(len(held[0]))}
         yield from series("memory", "trial", at, [held], **told, **axes)

@@ -24,10 +24,9 @@ import scipy.stats
 
 from credo.experiments import base
 from credo.report.rows import Results, write
-from credo.report.sections import Section, Summary, Table
+from credo.report.sections import Section, Summary, Table, Tracks
 
 RESULTS = Path(__file__).parents[1] / "results"
-WORD = re.compile(r"[^\s,]+")
 NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?")
 LOG_HEAD = """# Results in rows: before and after
 
@@ -37,7 +36,7 @@ the entries of rows and the points of curves, with their sum. All other leaves o
 the axes of its curves and labels. The last columns count the numbers in the tables of the old
 `report.html`, and those of them that are on the new page or follow from the runs that a cell there
 shows (mean, median, range, standard deviation, standard error, interval of Student's t), rounded as
-they were.
+they were. What is missing are runs that were numbered 0 to 9 and are named by their seeds now.
 
 | file | leaves | axes, labels | values | sum before | sum after | equal | old page | new page |
 |---|---|---|---|---|---|---|---|---|
@@ -64,20 +63,20 @@ def convert(path: Path) -> tuple[Results, dict[str, Any]]:
 
 def compare(old: dict[str, Any], new: Results) -> dict[str, Any]:
     """What an old tree has and new rows have. Raises `ValueError` unless every leaf is one value,
-    or else lies on the axis of a curve, is a label or a part of a cell's old name; and no value is
-    new."""
-    before = Counter(map(tagged, leaves(old["measured"])))
+    or else lies on the axis of a curve, is a label or a part of a cell's old name, or stood under a
+    key that has become a label; and no value is new."""
+    measured = old["measured"]
+    before = Counter(map(tagged, leaves(measured)))
     values = [row.value for row in new.rows] + [y for curve in new.curves for y in curve.values]
     after = Counter(map(tagged, leaves(values)))
     rest = before - after
     places = {tagged(x) for curve in new.curves for x in curve.at}
     places |= {tagged(x) for item in [*new.rows, *new.curves] for x in item.labels.values()}
-    names = {word for name in old["cells"] for word in WORD.findall(name)}
+    names = words(" ".join(old["cells"]))
 
-    def told(kind: str, leaf: Any) -> bool:
-        return (kind, leaf) in places or (kind == "str" and set(WORD.findall(leaf)) <= names)
-
-    added, lost = after - before, [x for x in rest if not told(*x)]
+    places |= {("str", text) for kind, text in rest if kind == "str" and words(text) <= names}
+    places |= set(map(tagged, leaves(list(named_leaves(measured)))))
+    added, lost = after - before, [x for x in rest if x not in places]
     if added or lost:
         raise ValueError(f"{new.experiment}: new values {list(added)[:9]}, lost {lost[:9]}")
     sums = [total((before - rest).elements()), total(after.elements())]
@@ -88,6 +87,22 @@ def compare(old: dict[str, Any], new: Results) -> dict[str, Any]:
         "sums": sums,
         "equal": before - rest == after,
     }
+
+
+def named_leaves(tree: Any) -> Iterator[Any]:
+    """What stands under keys that have become labels."""
+    for key, inner in tree.items() if isinstance(tree, dict) else ():
+        if key in import_module("convert_chapters_3_4").AXES:
+            yield inner
+    for inner in (
+        tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
+    ):
+        yield from named_leaves(inner)
+
+
+def words(text: str) -> set[str]:
+    """Without commas."""
+    return set(re.findall(r"[^\s,]+", text))
 
 
 def leaves(tree: Any) -> Iterator[Any]:
@@ -151,7 +166,8 @@ def found(text: str, known: np.ndarray) -> bool:
 
 def numbers(sections: Iterable[Section]) -> Iterator[Any]:
     """Everything that the tables of a page say, and what follows from the runs in a cell."""
-    for section in sections:
+    tables = [x.table if isinstance(x, Tracks) else x for x in sections]
+    for section in tables:
         for cell in [x for row in section.rows for x in row] if isinstance(section, Table) else []:
             if isinstance(cell, Summary):
                 yield from of_runs(cell)

@@ -468,7 +468,7 @@ def test_a_run_is_as_good_as_the_table_in_any_order_of_the_configurations():
     table = sections(found)["Every run"]
     assert [row[3:] for row in table.rows] == [["yes", 5], ["no", 5]]
     assert [row[1] for row in table.rows] == ["4, 5, 4, 6, 4, 5", "6, 6, 6, 6, 3, 6"]
-    best = sections(found)["Champion of the best run"]
+    best = sections(found)["Champion of seed 201, the best of its cell"]
     assert best.rows[2] == ["NGGN", 5.0, "6", "[0.5]", "[1, 0, 2]"]
 
 
@@ -513,7 +513,7 @@ def test_what_happens_to_a_fleet_is_compared_world_by_world(of_teams):
 def test_fleets_that_change():
     env = ServerFleet(devices=4, requests=2, nefarious=2)
     team = DMMU(hidden=2).init(*env.sizes, key=jax.random.key(0))
-    found = beyond_4.variants(env, team)
+    found = fleet.changes(env, team)
     assert list(found) == [
         "10 servers",
         "3 of 10 leave at step 7",

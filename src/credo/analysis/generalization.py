@@ -4,10 +4,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
 
 from ..compilation import jit
 from ..rollout import play_sequences
+from . import counting
 
 
 @jit
@@ -27,3 +29,18 @@ def success_with_gap(
     sequences = jax.vmap(sequence)(jax.random.split(key, episodes))
     sequences = jax.tree.map(lambda x: x[None], sequences)
     return jnp.mean(play_sequences(task, policies, sequences).returns["success"], axis=1)
+
+
+def first_mistakes(
+    policies: PyTree, depth: int, sequences: int = 1000, batches: int = 50, *, key: Array
+) -> Int[np.ndarray, "policies sequences"]:
+    """Signals of sequence classification answered right before the first mistake, at most `depth`.
+
+    An answer must be right at every signal: success at depth d is a first mistake after signal d
+    (Figure 3.5b). Sequences of one batch share their distractors; so there are many batches.
+    """
+    parts = [
+        np.asarray(counting.longest_correct(policies, depth, sequences // batches, key=key))
+        for key in jax.random.split(key, batches)
+    ]
+    return np.concatenate(parts, axis=1)

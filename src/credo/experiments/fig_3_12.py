@@ -1,8 +1,9 @@
 """Figure 3.12: an MMU by gradient on sequence recall, beside evolution."""
 
 from .base import Cell, Experiment
-from .fig_3_4a import LINE, TABLE, baseline, cell, learning, success, summary
-from .fig_3_11 import ABOUT, GRADIENT, at_deepest, by_instances, over_instances
+from .dissertation import notes, told
+from .fig_3_4a import LINE, MEASURES, SUMMARY, TABLE, cell
+from .fig_3_11 import GRADIENT, at_deepest, by_instances, over_instances
 
 DEPTHS = {"smoke": (2,), "quick": (2, 4, 6), "full": (2, 4, 6)}
 
@@ -21,10 +22,14 @@ def cells(budget: str) -> list[Cell]:
 
 
 EXPERIMENT = Experiment(
-    published="Figure 3.12 of the dissertation (curves without numbers): a very high level of "
-    "accuracy at every depth from 1 to 6, better than by evolution after as many reinforcement "
-    "instances.",
+    **told("fig-3.12"),
     cells=cells,
-    measures=(baseline, success, learning, over_instances),
-    views=(summary(), by_instances("(a) {panel}", ("depth",), LINE), at_deepest, TABLE, ABOUT),
+    measures=(*MEASURES, over_instances),
+    views=(
+        SUMMARY,
+        by_instances("(a) {panel}", ("depth",), LINE),
+        at_deepest,
+        TABLE,
+        notes("gradient"),
+    ),
 )

@@ -1,27 +1,28 @@
 """Figure 3.4b: an evolved MMU beside evolved recurrent networks, sequence classification."""
 
 from .base import Cell, Experiment
-from .fig_3_4a import TABLE, baseline, cell, learning, success, summary
+from .dissertation import told
+from .fig_3_4a import MEASURES, SUMMARY, TABLE, cell
 
-DEPTHS = {"smoke": (3,), "quick": (2, 4, 6), "full": (2, 3, 4, 5, 6)}
-NETWORKS = ("mmu", "lstm", "gru", "rnn")
+DEPTHS = {
+    "classification": {"smoke": (3,), "quick": (2, 4, 6), "full": (2, 3, 4, 5, 6)},
+    "recall": {"smoke": (2,), "quick": (2, 4, 6), "full": (1, 2, 3, 4, 5, 6)},
+}
 
 
-def cells(budget: str) -> list[Cell]:
+def networks(budget: str, task: str, preset: str) -> list[Cell]:
     """Four networks under the same operators."""
     return [
-        cell(budget, "classification", depth, preset, network=network)
-        for preset in ("as coded", "ours")
-        for network in NETWORKS
-        for depth in DEPTHS[budget]
+        cell(budget, task, depth, preset, network=network)
+        for network in ("mmu", "lstm", "gru", "rnn")
+        for depth in DEPTHS[task][budget]
     ]
 
 
-EXPERIMENT = Experiment(
-    published="Figure 3.4b of the dissertation (curves): the MMU after 1,000 generations is above "
-    "NEAT-RNN and NEAT-LSTM after 15,000 (Rawal & Miikkulainen 2016), at depths 2 to 6. Here the "
-    "networks have a fixed form and are evolved by the same operators; NEAT is not here yet.",
-    cells=cells,
-    measures=(baseline, success, learning),
-    views=(summary(), TABLE),
-)
+def cells(budget: str) -> list[Cell]:
+    """By the author's operators and by ours."""
+    return [x for y in ("as coded", "ours") for x in networks(budget, "classification", y)]
+
+
+VIEWS = (SUMMARY, TABLE)
+EXPERIMENT = Experiment(**told("fig-3.4b"), cells=cells, measures=MEASURES, views=VIEWS)

@@ -1,6 +1,7 @@
 """Figure 3.6: where and when a champion writes, on the permutation [-1, 1, -1]."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ from ..environments.sequence_classification import SequenceClassification
 from ..report import sections as page
 from ..report.rows import Results, Row, Series, rows, series
 from .base import Experiment, Trained, Value
+from .dissertation import told
 from .fig_3_4a import deepest, rounded
 from .table_3_1 import best_seed, lengths, names
 from .views import Runs, each, of_metric
@@ -20,20 +22,18 @@ def writes_on(signals: Sequence[float]) -> Callable[[Trained], Iterator[Row | Se
     champion the share of its writing that happens at signals."""
 
     def measure(trained: Trained) -> Iterator[Row | Series]:
-        depth = len(signals)
+        depth, labels = len(signals), trained.labels
         given = jnp.asarray(signals, jnp.float32)
         inputs = SequenceClassification(depth, 15, 15).lay_out(given, jnp.full(depth, 15)).inputs
-        best, told = int(lengths(trained).argmax()), trained.labels
-        yield Row(told, None, "best run", best)
-        steps = np.arange(1, len(inputs) + 1)
-        yield from series("input", "step", steps, np.asarray(inputs[:, 0], int), told)
+        best, steps = int(lengths(trained).argmax()), np.arange(1, len(inputs) + 1)
+        yield Row(labels, None, "best run", best)
+        yield from series("input", "step", steps, np.asarray(inputs[:, 0], int), labels)
         found = [memory.write_magnitudes(run.champion, inputs) for run in trained.runs]
         cells = rounded(found[best], 3).T[None]
-        seed = [trained.seeds[best]]
-        axes = {"seed": seed, "cell": names(len(cells[0]))}
-        yield from series("write", "step", steps, cells, told, **axes)
-        share = [memory.share_at_signals(x, inputs) for x in found]
-        yield from rows("share at signals", rounded(share), told, seed=trained.seeds)
+        axes: dict[str, Any] = {"seed": [trained.seeds[best]], "cell": names(len(cells[0]))}
+        yield from series("write", "step", steps, cells, labels, **axes)
+        share = rounded([memory.share_at_signals(x, inputs) for x in found])
+        yield from rows("share at signals", share, labels, seed=trained.seeds)
 
     return measure
 
@@ -48,7 +48,7 @@ def heat_map(signals_only: bool) -> Callable[..., Iterable[page.Section]]:
         yield page.HeatMap(
             f"Write magnitude of the champion of seed {best_seed(results)}",
             [[curve.values[i] for i in shown] for curve in writes],
-            [curve.labels["cell"] for curve in writes],
+            [str(curve.labels["cell"]) for curve in writes],
             [f"{inputs[i]:+d}" if inputs[i] else "0" for i in shown],
             "input",
             "memory cell",
@@ -63,8 +63,7 @@ SHARES = Runs(
     caption="100 % where distractors move nothing, as published for the champion.",
 )
 EXPERIMENT = Experiment(
-    published="Figure 3.6 of the dissertation: two cells are written at signals, one at -1 and one "
-    "at +1; at distractors nothing is written.",
+    **told("fig-3.6"),
     cells=deepest,
     measures=(writes_on([-1.0, 1.0, -1.0]),),
     views=(heat_map(signals_only=False), SHARES),

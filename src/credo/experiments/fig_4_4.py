@@ -1,7 +1,8 @@
 """Figure 4.4: two to four learning robots, Spread, no static robot."""
 
 from .base import Cell, Experiment
-from .fig_4_2 import BUDGETS, CURVES, SCORES, about, cell, levels, pictures, shares
+from .dissertation import notes, told
+from .fig_4_2 import BUDGETS, MEASURES, VIEWS, cell
 
 
 def cells(budget: str) -> list[Cell]:
@@ -16,11 +17,9 @@ def cells(budget: str) -> list[Cell]:
 
 
 EXPERIMENT = Experiment(
-    published="Figure 4.4 of the dissertation (bars without numbers): MMU teams are better than "
-    "feed-forward ones at every size and grow with it, 2-deep and 3-deep; feed-forward teams "
-    "hardly do.",
-    cells=cells,
-    measures=(levels, shares),
-    views=(SCORES, CURVES, pictures, about("Every robot has a population of its own.")),
+    **told("fig-4.4"),
     budgets=BUDGETS,
+    cells=cells,
+    measures=MEASURES,
+    views=(*VIEWS, notes("T-mazes", "fig-4.4")),
 )

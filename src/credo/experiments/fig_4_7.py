@@ -1,7 +1,5 @@
-"""Figure 4.7: DMMU and its baselines on the server fleet, synchronous and asynchronous.
-
-The cells of all fleets of chapter 4 are made here, by `cell`, and what their figures measure.
-"""
+"""Figure 4.7: DMMU and its baselines on the server fleet, synchronous and asynchronous. Also what
+all fleets of chapter 4 share: cells, measurements, the table."""
 
 from dataclasses import replace
 from functools import cache
@@ -23,9 +21,9 @@ from ..networks.mlp import MLP
 from ..networks.recurrent import Recurrent
 from ..networks.team import Centralized, Team
 from ..report.rows import Row, Series, rows
-from ..report.sections import Text
 from ..rollout import evaluate
-from .base import Cell, Experiment, Trained, Value
+from .base import Cell, Experiment, Trained
+from .dissertation import notes, told
 from .fig_3_4a import rounded
 from .fig_4_2 import BUDGETS, SMOOTHED, learned
 from .views import Curves, Table, known, mean, median, published
@@ -33,16 +31,7 @@ from .views import Curves, Table, known, mean, median, published
 EPISODES = 500  # fresh ones for a final champion; the dissertation used 10
 METRIC = "net requests"
 TIMING: dict[str, Any] = {"synchronous": 1, "asynchronous": (0, 2)}  # steps that a server is busy
-MUTATION = MatrixMutation(
-    probability=0.5,
-    one_in=10,
-    strength=0.3,
-    super_probability=0.1,
-    reset_probability=0.1,
-)
-"""Of the case study. Stronger than the printed one (0.9 of the matrices, 10 % noise, no more),
-which learns much slower: docs/team-memory.md."""
-
+PLANS = {"smoke": (4, 2), "quick": (100, 2), "full": (2_000, 1), "published": (15_000, 10)}
 HIT = 3  # matrices of a large fleet that a mutation changes, on average
 
 
@@ -52,12 +41,6 @@ def gentle(env: ServerFleet, network: AbstractNetwork) -> MatrixMutation:
     genome = eqx.filter_eval_shape(lambda key: network.init(*env.sizes, key=key), jax.random.key(0))
     share = min(0.9, HIT / len(jax.tree.leaves(genome)))
     return MatrixMutation(probability=share, one_in=10, strength=0.5, super_probability=0.05)
-
-
-def large(**fields: Any) -> ServerFleet:
-    """The fleet of Figure 4.7. Counts are observed as small numbers: 20 devices with 5 requests
-    each would drown the one number that says what a request was worth."""
-    return ServerFleet(scale=(0.02, 1.0), **fields)
 
 
 def networks(hidden: int = 30) -> dict[str, AbstractNetwork]:
@@ -96,33 +79,25 @@ def cell(
         sizes = {"population_size": 6, "elite_fraction": 0.2, "episodes": 2, "test_episodes": 2}
         algorithm = replace(algorithm, **sizes)
     generations, runs = plan
-    # Settings were chosen by looking at seeds below 200.
-    return Cell(labels, algorithm, range(200, 200 + runs), generations)
+    seeds = range(200, 200 + runs)  # settings were chosen by looking at lower ones
+    return Cell(labels, algorithm, seeds, generations)
 
 
 def cells(budget: str) -> list[Cell]:
     """Both timings and all networks; at full three of them, as far as compute goes."""
     tiny = budget == "smoke"
     sizes: dict[str, Any] = {"servers": 2, "devices": 4, "nefarious": 2} if tiny else {}
-    plans = {"smoke": (4, 2), "quick": (100, 2), "full": (2_000, 1), "published": (15_000, 10)}
-    chosen = ("dmmu", "lstmne", "ffne")
-    tasks = {timing: large(busy=busy, **sizes) for timing, busy in TIMING.items()}
-    return [
-        cell(
-            budget,
-            {"task": "server fleet", "timing": timing, "network": name},
-            env,
-            network,
-            plans[budget],
-            mutation=gentle(env, network),
-        )
-        for timing, env in tasks.items()
-        for name, network in networks(2 if tiny else 30).items()
-        if budget != "full" or name in chosen
-    ]
-
-
-# --------------------------------------------------------------------------------------- measures
+    found = []
+    for timing, busy in TIMING.items():
+        # Counts are observed as small numbers: 20 devices with 5 requests each would drown the one
+        # number that says what a request was worth.
+        env = ServerFleet(scale=(0.02, 1.0), busy=busy, **sizes)
+        for name, network in networks(2 if tiny else 30).items():
+            if budget != "full" or name in ("dmmu", "lstmne", "ffne"):
+                labels = {"task": "server fleet", "timing": timing, "network": name}
+                mutation = gentle(env, network)
+                found.append(cell(budget, labels, env, network, PLANS[budget], mutation=mutation))
+    return found
 
 
 def net(trained: Trained) -> list[Row | Series]:
@@ -161,8 +136,6 @@ def nobody_writes(trained: Trained) -> list[Row]:
     return rows(f"{METRIC} while nobody writes", found, trained.labels, seed=trained.seeds)
 
 
-# ------------------------------------------------------------------------------------------ views
-
 CURVES = Curves(
     f"test {METRIC}, smoothed",
     "generation",
@@ -193,59 +166,11 @@ SCORES = Table(
     "the classes. While nobody writes a DMMU has no memory, neither of others nor of its own, but "
     "the last output.",
 )
-STRONGER = (
-    "Mutation is stronger than printed: half of the matrices, a tenth of their weights, 30 % "
-    "noise, a tenth of the hits super (10 times the weight) and a tenth drawn anew."
-)
-GENTLER = (
-    f"Mutation is gentler than printed: of a genome {HIT} matrices on average, a tenth of their "
-    "weights, 50 % noise, a twentieth of the hits super (10 times the weight). Weights start at "
-    "N(0, 1), the output weights of feed-forward networks smaller, the write gates of DMMU shut. "
-    "Counts of requests are observed times 0.02. These settings were chosen for DMMU, synchronous, "
-    "with seeds 0 and 1; of a centralized network's four matrices three are hit."
-)
-
-
-def about(episodes: int, *paragraphs: str) -> Text:
-    """What to know before comparing."""
-    return Text(
-        "How to read it",
-        [
-            f"Algorithm 5 with k 100, 4 elites, {episodes} episodes per fitness (printed: 10), the "
-            "same budget for every network. Centralized networks have no agents that could change "
-            "places.",
-            *paragraphs,
-        ],
-    )
-
-
-def _given(value: str, timing: str, network: str) -> Value:
-    source = "Figure 4.7, 10 runs"
-    return Value(value, METRIC, source, {"timing": timing, "network": network})
-
-
+MEASURES = (references, net, nobody_writes)
 EXPERIMENT = Experiment(
-    published="Figure 4.7 of the dissertation, 10 runs, net requests served: DMMU 11.93 ± 0.63 "
-    "synchronous and 8.25 ± 0.39 asynchronous; LSTM ensemble 5.8 ± 0.73 and about 0; feed-forward "
-    "ensemble, centralized network and LSTMs with shared memory about 0.",
-    cells=cells,
-    measures=(references, net, nobody_writes),
-    views=(
-        SCORES,
-        CURVES,
-        about(
-            10,
-            GENTLER,
-            "The author's generations are 15,000, the budget `published` here. He let several "
-            "servers take the last request; here a request is served once.",
-        ),
-    ),
-    values=(
-        _given("11.93 ± 0.63", "synchronous", "dmmu"),
-        _given("8.25 ± 0.39", "asynchronous", "dmmu"),
-        _given("5.8 ± 0.73", "synchronous", "lstmne"),
-        _given("~0", "asynchronous", "lstmne"),
-        *(_given("~0", timing, x) for timing in TIMING for x in ("ffne", "cnf", "lstmsm")),
-    ),
+    **told("fig-4.7"),
     budgets=BUDGETS,
+    cells=cells,
+    measures=MEASURES,
+    views=(SCORES, CURVES, notes("fleets", "fig-4.7")),
 )

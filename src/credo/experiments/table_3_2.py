@@ -7,8 +7,9 @@ import numpy as np
 
 from ..analysis import counting
 from ..report import sections as page
-from ..report.rows import Results, Row, rows
+from ..report.rows import Results, Row, Series, rows, series
 from .base import Cell, Experiment, Trained, Value
+from .dissertation import told
 from .fig_3_4a import deepest, rounded
 from .table_3_1 import names
 from .views import Of, Runs, computed, of_metric, of_seed
@@ -22,30 +23,29 @@ def cells(budget: str) -> list[Cell]:
     return deepest(budget, ("as coded", "ours"))
 
 
-def study(trained: Trained) -> Iterator[Row]:
-    """So many signals -1, then so many +1: the memory on the way, and how many of each sign every
-    cell counted."""
-    fed, key = SIGNALS[trained.budget], jax.random.key(50_000)
-    yield from rows("signals fed", fed, trained.labels, sign=SIGNS)
-    found = counting.counting_study(trained.champions, *fed, key=key)
-    final = rounded(found.memory, 2)
-    told = {"seed": trained.seeds, "cell": names(final.shape[2])}
-    for minus, plus, memory in zip(found.negatives, found.positives, final, strict=True):
-        at = {**trained.labels, "negatives": int(minus), "positives": int(plus)}
-        yield from rows("memory", memory, at, **told)
+def study(trained: Trained) -> Iterator[Row | Series]:
+    """So many signals -1, then so many +1: the memory on the way, how many of each sign every cell
+    counted, and how many random signals are answered right."""
+    fed, labels = SIGNALS[trained.budget], trained.labels
+    yield from rows("signals fed", fed, labels, sign=SIGNS)
+    found = counting.counting_study(trained.champions, *fed, key=jax.random.key(50_000))
+    memory = rounded(np.moveaxis(np.asarray(found.memory), 0, -1), 2)
+    axes = {"seed": trained.seeds, "cell": names(memory.shape[1])}
+    at = {"-1": np.unique(found.negatives), "+1": np.unique(found.positives)[1:]}
+    first = len(at["-1"])
+    for sign, part in (("-1", memory[..., :first]), ("+1", memory[..., first:])):
+        here = {**labels, "sign": sign}
+        yield from series("memory", "signals of this sign", at[sign], part, here, **axes)
     counted = np.moveaxis(np.asarray(found.counted), 1, 2)
-    yield from rows("signals counted", counted, trained.labels, **told, sign=SIGNS)
+    yield from rows("signals counted", counted, labels, **axes, sign=SIGNS)
+    yield from streams(trained, fed[1])
 
 
 def streams(trained: Trained, signals: int, count: int = 10) -> list[Row]:
     """Signals of random streams of ±1 answered right in a row, by run and stream."""
-    found = counting.longest_correct(trained.champions, signals, count, key=jax.random.key(60_000))
+    key = jax.random.key(60_000)
+    found = counting.longest_correct(trained.champions, signals, count, key=key)
     return rows("signals right", found, trained.labels, seed=trained.seeds, stream=None)
-
-
-def random_signals(trained: Trained) -> list[Row]:
-    """As many as there were of +1."""
-    return streams(trained, SIGNALS[trained.budget][1])
 
 
 def furthest(sign: str) -> Of:
@@ -59,44 +59,53 @@ def furthest(sign: str) -> Of:
     return of
 
 
+def to_the_end(results: Results, values: Sequence[Value]) -> page.Cell:
+    """How many runs are right to the end, on all of their streams."""
+    fed = max(row.value for row in of_metric(results, "signals fed").rows)
+    told = computed("signals right", lambda x: f"{(x.min(axis=1) >= fed).sum()} of {len(x)}")
+    return told(results, values)
+
+
+WORST = computed("signals right", lambda x: f"{int(x.min(axis=1).max()):,}")
+MEDIAN = computed("signals right", lambda x: f"{int(np.median(x)):,}")
+
+
 def champion(results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
     """The dissertation's table for the champion that goes furthest, of each preset."""
     for preset in results.levels("preset"):
         here = results.where(preset=preset)
-        right = here.by_seed("signals right")
+        right, fed = here.by_seed("signals right"), here.value("signals fed", sign="-1")
         best = max(right, key=lambda seed: (min(right[seed]), np.mean(right[seed])))
-        run = of_seed(here, best)
         body = []
-        for at in run.levels("negatives", "positives"):
-            memory = run.where(negatives=at[0], positives=at[1]).rows
-            body.append([f"{n:,}" for n in at] + [f"{row.value:,.2f}" for row in memory])
-        yield page.Table(
-            f"Memory of seed {best}, {preset}", ["#-1", "#+1", *run.levels("cell")], body
-        )
+        for sign in SIGNS:
+            found = of_seed(here, best).where(sign=sign).curves
+            for i, n in enumerate(found[0].at):
+                counts = (n, 0) if sign == "-1" else (fed, n)
+                body.append([*map("{:,}".format, counts), *(f"{x.values[i]:,.2f}" for x in found)])
+        columns = ["#-1", "#+1", *(x.labels["cell"] for x in found)]
+        yield page.Table(f"Memory of seed {best}, {preset}", columns, body)
 
 
-EXPERIMENT = Experiment(
-    published="Table 3.2 of the dissertation: after 10^5 signals -1 and then 10^6 signals +1, one "
-    "cell of the champion counted +1 to 1,000,000; the other counted -1 to 1,244 and saturated.",
-    cells=cells,
-    measures=(study, random_signals),
-    views=(
-        Runs(
-            "How far each champion counts: {panel}",
-            {
-                "-1": furthest("-1"),
-                "+1": furthest("+1"),
-                "random signals right, worst of 10": computed(
-                    "signals right", lambda x: f"{int(x.min()):,}"
-                ),
-                "median of 10": computed("signals right", lambda x: f"{int(np.median(x)):,}"),
-            },
-            panel=("preset",),
-            caption="Counted: the signals of one sign at each of which the cell moved the same "
-            "way, before it once did not; 100,000 of -1 were fed and then 1,000,000 of +1 (10,000 "
-            "of each at quick). Random signals: answered right in a row in streams of ±1, which "
-            "share their distractors; they end at as many as there were of +1.",
-        ),
-        champion,
-    ),
+def runs(results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
+    """How far each champion counts."""
+    for preset in results.levels("preset"):
+        here = results.where(preset=preset)
+        minus, plus = (here.value("signals fed", sign=sign) for sign in SIGNS)
+        end: Of = computed("signals right", lambda x, n=plus: "yes" if x.min() >= n else "no")
+        columns = {
+            f"-1, of {minus:,}": furthest("-1"),
+            f"+1, of {plus:,}": furthest("+1"),
+            "random signals right, worst of 10": WORST,
+            "median of 10": MEDIAN,
+            f"counts to {plus:,}": end,
+        }
+        view = Runs(f"How far each champion counts: {preset}", columns, caption=CAPTION)
+        yield from view(here, values)
+
+
+CAPTION = (
+    "Counted: the signals of one sign at each of which the cell moved the same way, before it "
+    "once did not. Random signals: answered right in a row in streams of ±1, which share their "
+    "distractors."
 )
+EXPERIMENT = Experiment(**told("table-3.2"), cells=cells, measures=(study,), views=(runs, champion))

@@ -149,6 +149,11 @@ def median(metric: str, scale: float = 1.0, **labels: Any) -> Of:
     return computed(metric, told, **labels)
 
 
+def best(metric: str, scale: float = 1.0) -> Of:
+    """The best of all runs."""
+    return computed(metric, lambda x: f"{scale * np.nanmax(np.mean(x, axis=1)):.1f}")
+
+
 def at(x: float, content: Of) -> Of:
     """What a content is of series that end at `x`; None if no series has a point there."""
 
