@@ -367,11 +367,11 @@ def of_metric(results: Results, metric: str) -> Results:
 
 
 def of_seed(results: Results, seed: int | None) -> Results:
-    """Only the rows and series of one run."""
+    """Only the rows and series of one run, and those of the cell as a whole."""
     return replace(
         results,
-        rows=[row for row in results.rows if row.seed == seed],
-        curves=[curve for curve in results.curves if curve.seed == seed],
+        rows=[row for row in results.rows if row.seed in (seed, None)],
+        curves=[curve for curve in results.curves if curve.seed in (seed, None)],
     )
 
 
