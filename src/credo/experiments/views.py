@@ -272,7 +272,8 @@ class Curves:
 
     def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
         chosen = of_metric(results.where(**self.where), self.y)
-        for key in combinations(chosen, self.panel):
+        measured = [*chosen.rows, *chosen.curves]
+        for key in combinations(chosen, self.panel) if measured else []:
             told = dict(zip(self.panel, key, strict=True))
             here, everything = chosen.where(**told), results.where(**self.where | told)
             lines = [dict(zip(self.line, x, strict=True)) for x in combinations(here, self.line)]
