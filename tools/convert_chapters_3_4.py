@@ -21,6 +21,12 @@ Labels = dict[str, Any]
 AXES = {"generation", "instances", "gaps", "depths", "depth", "permutations", "sums"}
 AXES |= {"rows", "noise", "cell", "where", "network"}
 
+ONLY = {  # what `--only` says of cells by their names of today
+    "3 robots|^synchronous, dmmu$": "robots 3|synchronous, dmmu$",
+    "converge 2-deep": "converge, depth 2",
+    "2-deep, 3 robots": "depth 2, robots 3",
+}
+
 
 def labels_3(name: str) -> Labels:
     """`recall 6-deep ours by gradient, lstm`."""
@@ -87,7 +93,10 @@ def results(
         assert not given, (old["experiment"], name, list(given))
     assert not measured, list(measured)
     found, curves = concat(parts)
-    return Results(old["experiment"], old["budget"], old["command"], cells, found, curves)
+    command = old["command"]
+    for before, now in ONLY.items():
+        command = command.replace(f"--only '{before}'", f"--only '{now}'")
+    return Results(old["experiment"], old["budget"], command, cells, found, curves)
 
 
 def prune(measured: dict[str, Any]) -> None:

@@ -325,10 +325,10 @@ def probe(policy: AbstractPolicy, task: SequenceClassification) -> dict[str, np.
         "permutations": np.asarray(states.signals, int),
         "sums": sums.astype(int),
         "memory": final,
-        "right": np.asarray(states.right).all(axis=1),
+        "right": np.all(np.asarray(states.right), axis=1, keepdims=False),
         "signatures": signatures,
         "masking costs": np.asarray(relevance.marginal_value),
         "needed": np.array(needed, int),
         "spread": np.array(max(spread)),
-        "predicts": np.array(len({found for found, _ in pairs}) == len(pairs)),
+        "predicts": np.array(len({x for x, _ in pairs}) == len(pairs)),
     }

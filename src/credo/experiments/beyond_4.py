@@ -163,7 +163,7 @@ def if_any(task: str, text: page.Text) -> Any:
 FLEETS = {"task": "server fleet"}
 IN_NOISE = Runs(
     "Noisy observations: net requests of final champions, by the noise of the test; {panel}",
-    {f"tested at std {x:g}": pair("net requests in noise", **{STD: x}) for x in TESTED},
+    {f"tested at std {x:g}": pair("net requests in noise", "", **{STD: x}) for x in TESTED},
     panel=("task", "timing", "network", "noise"),
     where=FLEETS,
     caption="Mean ± standard error over 500 fresh episodes, the same for all.",

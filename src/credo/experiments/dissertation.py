@@ -12,7 +12,7 @@ from .base import Value
 
 @cache
 def _every() -> dict[str, Any]:
-    path = resources.files(__package__).joinpath("dissertation.toml")
+    path = resources.files("credo.experiments").joinpath("dissertation.toml")
     return tomllib.loads(path.read_text(encoding="utf-8"))
 
 

@@ -160,7 +160,7 @@ def episode(trained: Trained, seed: int, played: dict[str, Any]) -> Iterator[Ser
     axes: dict[str, Any] = {"labels": trained.labels, "seed": [seed]}
     at, robots = range(1, trained.env.trials + 1), range(1, trained.env.robots + 1)
     for metric in EPISODE:
-        each = {"robot": robots} if metric in OF_ROBOTS else {}
+        each: dict[str, Any] = {"robot": robots} if metric in OF_ROBOTS else {}
         if played[metric] is not None:
             yield from series(metric, "trial", at, [played[metric]], **axes, **each)
     if len(robots) == 1:
@@ -171,7 +171,7 @@ def episode(trained: Trained, seed: int, played: dict[str, Any]) -> Iterator[Ser
 def pictures(results: Results, values: Sequence[Value]) -> Iterator[page.Section]:
     """An episode of the best final champion of each cell that has memory."""
     for key in combinations(results, (*PLACE, *LINE)):
-        labels = dict(zip((*PLACE, *LINE), key, strict=True))
+        labels: dict[str, Any] = dict(zip((*PLACE, *LINE), key, strict=True))
         here = results.where(**labels)
         curves = {x: of_metric(here, x).curves for x in (*EPISODE, "memory")}
         if not curves["goal"]:

@@ -81,7 +81,7 @@ def states(results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
         signature = [x.value for x in of_metric(here, "signature").rows]
         shown = map(str, [list(final.values()), relevant, signature])
         body.append([permutation, f"{total:+d}", *shown, yes("right")(here, values)])
-    title = f"Champion of seed {results.rows[0].seed}, the best of its cell; needed: {cells}"
+    title = f"Champion of seed {best_seed(results)}, the best of its cell; needed: {cells}"
     columns = ["permutation", "sum", "final memory", f"[{cells}]", "signature", "right"]
     yield page.Table(title, columns, body, caption="15 distractors between signals.")
 

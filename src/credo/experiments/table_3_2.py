@@ -52,9 +52,10 @@ def furthest(sign: str) -> Of:
     """How far the cell that counts this sign furthest gets, and which it is."""
 
     def of(results: Results, values: Sequence[Value]) -> page.Cell:
-        found = of_metric(results.where(sign=sign), "signals counted").rows
-        best = max(found, key=lambda row: row.value)
-        return f"{best.value:,} ({best.labels['cell'] if best.value else 'none'})"
+        here = results.where(sign=sign)
+        best = max(of_metric(here, "signals counted").rows, key=lambda row: row.value)
+        cell = best.labels["cell"] if best.value else "none"
+        return f"{best.value:,} of {here.value('signals fed'):,} ({cell})"
 
     return of
 
@@ -62,8 +63,12 @@ def furthest(sign: str) -> Of:
 def to_the_end(results: Results, values: Sequence[Value]) -> page.Cell:
     """How many runs are right to the end, on all of their streams."""
     fed = max(row.value for row in of_metric(results, "signals fed").rows)
-    told = computed("signals right", lambda x: f"{(x.min(axis=1) >= fed).sum()} of {len(x)}")
-    return told(results, values)
+
+    def count(x: np.ndarray) -> str:
+        whole = int((x.min(axis=1) >= fed).sum())
+        return f"{whole} of {len(x)}" if len(x) > 1 else "yes" if whole else "no"
+
+    return computed("signals right", count)(results, values)
 
 
 WORST = computed("signals right", lambda x: f"{int(x.min(axis=1).max()):,}")
@@ -86,26 +91,18 @@ def champion(results: Results, values: Sequence[Value]) -> Iterable[page.Section
         yield page.Table(f"Memory of seed {best}, {preset}", columns, body)
 
 
-def runs(results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
-    """How far each champion counts."""
-    for preset in results.levels("preset"):
-        here = results.where(preset=preset)
-        minus, plus = (here.value("signals fed", sign=sign) for sign in SIGNS)
-        end: Of = computed("signals right", lambda x, n=plus: "yes" if x.min() >= n else "no")
-        columns = {
-            f"-1, of {minus:,}": furthest("-1"),
-            f"+1, of {plus:,}": furthest("+1"),
-            "random signals right, worst of 10": WORST,
-            "median of 10": MEDIAN,
-            f"counts to {plus:,}": end,
-        }
-        view = Runs(f"How far each champion counts: {preset}", columns, caption=CAPTION)
-        yield from view(here, values)
-
-
-CAPTION = (
-    "Counted: the signals of one sign at each of which the cell moved the same way, before it "
-    "once did not. Random signals: answered right in a row in streams of ±1, which share their "
-    "distractors."
+RUNS = Runs(
+    "How far each champion counts: {panel}",
+    {
+        "-1": furthest("-1"),
+        "+1": furthest("+1"),
+        "random signals right, worst of 10": WORST,
+        "median of 10": MEDIAN,
+        "right to the end": to_the_end,
+    },
+    panel=("preset",),
+    caption="Counted: the signals of one sign at each of which the cell moved the same way, before "
+    "it once did not. Random signals: answered right in a row in streams of ±1, which share their "
+    "distractors and are as long as the one of +1.",
 )
-EXPERIMENT = Experiment(**told("table-3.2"), cells=cells, measures=(study,), views=(runs, champion))
+EXPERIMENT = Experiment(**told("table-3.2"), cells=cells, measures=(study,), views=(RUNS, champion))

@@ -23,7 +23,9 @@ from .views import Of, Runs, Table, computed, each, known, of_metric, published
 
 CONFIGURATIONS = ("GGNN", "NNGG", "NGGN", "GNNG", "GNGN", "NGNG")  # G: genuine, N: nefarious
 PLANS = {"smoke": (4, 2), "quick": (300, 2), "full": (2_000, 10), "published": (15_000, 10)}
-SUPER = {"super_probability": 0.1, "reset_probability": 0.1}
+MUTATION = MatrixMutation(
+    probability=0.5, one_in=10, strength=0.3, super_probability=0.1, reset_probability=0.1
+)
 
 
 def cells(budget: str) -> list[Cell]:
@@ -33,9 +35,8 @@ def cells(budget: str) -> list[Cell]:
     learns much slower: docs/team-memory.md. Ten episodes, as printed, may miss a configuration.
     """
     labels = {"task": "case study", "network": "dmmu"}
-    fields = {"mutation": MatrixMutation(0.5, one_in=10, strength=0.3, **SUPER), "episodes": 30}
-    task = (ServerFleet.case_study(), DMMU(hidden=3))
-    return [cell(budget, labels, *task, PLANS[budget], **fields)]
+    task, fields = (ServerFleet.case_study(), DMMU(hidden=3)), {"mutation": MUTATION}
+    return [cell(budget, labels, *task, PLANS[budget], **fields, episodes=30)]
 
 
 def played(trained: Trained) -> Iterator[Row | Series]:

@@ -282,7 +282,8 @@ class Curves:
 
     def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
         chosen = of_metric(results.where(**self.where), self.y)
-        for key in combinations(chosen, self.panel):
+        measured = [*chosen.rows, *chosen.curves]
+        for key in combinations(chosen, self.panel) if measured else []:
             told = dict(zip(self.panel, key, strict=True))
             here, everything = chosen.where(**told), results.where(**{**self.where, **told})
             lines = [dict(zip(self.line, x, strict=True)) for x in combinations(here, self.line)]
@@ -389,8 +390,8 @@ def of_metric(results: Results, metric: str) -> Results:
 
 
 def of_seed(results: Results, seed: int | None) -> Results:
-    """Only the rows and series of one run."""
-    return only(results, lambda item: item.seed == seed)
+    """Only the rows and series of one run, and those of the cell as a whole."""
+    return only(results, lambda item: item.seed in (seed, None))
 
 
 def only(results: Results, test: Callable[[Any], bool]) -> Results:
