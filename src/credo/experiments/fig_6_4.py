@@ -1,39 +1,37 @@
 """Figure 6.4: how much the resource manager explores."""
 
-from typing import Any
-
 from ..learners.manager import UCB
-from . import chapter5, chapter6
-from .base import Cell
+from .base import Cell, Experiment
+from .fig_5_3 import BUDGETS, REFERENCES, curves, notes, table
+from .fig_6_5 import ALLOCATION, ATTRIBUTION, HUMANOID, MEASURES, cerl, tasks
 
-TITLE = "exploration of the resource manager"
-PUBLISHED = (
-    "Figure 6.4 of the dissertation (curves without numbers), on Humanoid: c = 0.9 is best; 0 and "
-    "5 learn too, with more frames; 10 needs more still."
-)
-BUDGETS = chapter6.BUDGETS
 COEFFICIENTS = (0.0, 0.9, 5.0, 10.0)
 PUBLISHED_C = 0.9
 
 
 def cells(budget: str) -> list[Cell]:
-    (task,) = chapter6.tasks(budget, (chapter6.HUMANOID,))
+    """CERL at each coefficient c of UCB."""
+    (task,) = tasks(budget, (HUMANOID,))
     return [
-        chapter6.cerl("cerl", task, budget)
+        cerl(task, budget)
         if c == PUBLISHED_C
-        else chapter6.cerl(f"cerl c {c:g}", task, budget, manager=UCB(exploration=c))
+        else cerl(task, budget, labels={"exploration": c}, manager=UCB(exploration=c))
         for c in COEFFICIENTS
     ]
 
 
-measure = chapter6.measure
-
-
-def sections(measured: dict[str, Any]) -> list[Any]:
-    return [
-        *chapter5.by_task(measured),
-        chapter5.scores(measured, interval=True),
-        chapter6.allocation(measured, {}),
-        *chapter6.attributions(measured),
-        chapter5.about(measured, f"The cell without a number has c = {PUBLISHED_C}."),
-    ]
+EXPERIMENT = Experiment(
+    published="Figure 6.4 of the dissertation (curves without numbers), on Humanoid: c = 0.9 is "
+    "best; 0 and 5 learn too, with more frames; 10 needs more still.",
+    budgets=BUDGETS,
+    cells=cells,
+    measures=MEASURES,
+    values=REFERENCES,
+    views=(
+        curves(),
+        table(),
+        ALLOCATION,
+        *ATTRIBUTION,
+        notes(f"Exploration is the manager's c; where none is named, it is {PUBLISHED_C}."),
+    ),
+)
