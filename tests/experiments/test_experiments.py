@@ -9,13 +9,13 @@ import jax
 import numpy as np
 import pytest
 
-from credo import cli
 from credo.algorithms.bptt import BPTT
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
 from credo.executors import local
 from credo.experiments import base, chapter3, fig_3_4a
+from credo.experiments.catalogue import EXPERIMENTS
 from credo.networks.mmu import MMU
 from credo.report import page
 from credo.runs import config
@@ -84,7 +84,7 @@ def cells_of(name: str, runs: dict[str, list[Run]]) -> dict[str, list[Run]]:
 
 
 def test_the_command_line_lists_what_there_is():
-    assert list(cli.EXPERIMENTS) == list(base.MODULES)
+    assert list(EXPERIMENTS) == list(base.MODULES)
     modules = {path.stem for path in pathlib.Path(base.__file__).parent.glob("*.py")}
     shared = {
         "__init__",

@@ -1,0 +1,49 @@
+"""All settings of a training as TOML, a line a flag: `credo train --config run.toml`."""
+
+import json
+import pathlib
+import tomllib
+from typing import Any
+
+from .line import Line
+from .names import fail
+
+OWN = ("config", "save_config", "print_config")  # about the file itself
+
+
+def read(path: str) -> list[tuple[str, list[str]]]:
+    """Flags as if they were typed. Tables may be nested: `[learner]`, `gamma = 0.9`."""
+    try:
+        return list(_flat(tomllib.loads(pathlib.Path(path).read_text("utf-8")), ""))
+    except (OSError, ValueError) as error:
+        fail(f"--config {path}: {error}")
+
+
+def _flat(table: dict[str, Any], prefix: str):
+    for key, value in table.items():
+        name = f"{prefix}{key}".replace("_", "-")
+        if isinstance(value, dict):
+            yield from _flat(value, f"{name}.")
+        else:
+            yield name, [str(x) for x in (value if isinstance(value, list) else [value])]
+
+
+def written(command: Any, algorithm: Any) -> str:
+    """The settings of a command and of its algorithm, for `read`."""
+    told = {"algorithm": command.algorithm, "task": command.task}
+    for value, empty in ((command, (None, {}, ())), (algorithm, ())):
+        line = Line("train", [])
+        line.skipped = {"algorithm", "task", "id", *OWN}
+        line.take(value)
+        told |= {flag.name: flag.value for flag in line.flags.values() if flag.value not in empty}
+    return "".join(f"{json.dumps(name)} = {_toml(value)}\n" for name, value in told.items())
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        value = [f"{name}={x!r}" for name, x in value.items()]
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value) if isinstance(value, int | float) else json.dumps(str(value))
