@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import textwrap
+import tomllib
 import warnings
 
 import pytest
@@ -128,6 +129,18 @@ def test_list_names_everything(credo):
         (f"{TRAIN} --depth 0", "depth is 0: it must be at least 1", ""),
         (f"{TRAIN} --generations 0", "--generations is 0: it must lie in [1, ", ""),
         (f"{TRAIN} --frames 0", "--frames is 0: it must lie in [1, ", ""),
+        ("td3 Pendulum-v1", "td3 is an algorithm: credo train td3 TASK", ""),
+        ("train merl Pendulum-v1", "merl trains teams", "or train erl"),
+        ("train td3 ALE/Pong-v5", "a task of ale-py: pip install ale-py", "ale_py:ALE/Pong-v5"),
+        ("train td3 my.Env", "no module 'my.Env'", "is written my:Env"),
+        ("train td3 Pendulum-v1 --id Hopper-v5", "no flag '--id'", "the task is a word"),
+        ("check Pendulum-v1 --id Hopper-v5", "no flag '--id'", "the task is a word"),
+        ("train td3 Pendulum-v1 --name x", "no flag '--name'", "it is called --path"),
+        ("train td3 Pendulum-v1 --network lstmm", "no network 'lstmm'", "did you mean 'lstm'?"),
+        ("train erl Pendulum-v1 --preset as-coded", "no preset 'as-coded' of erl", "one of: ours"),
+        ("train cerl Pendulum-v1 --manager thomson", "no manager 'thomson'", "'thompson'?"),
+        ("train erl Pendulum-v1 --gamma big", "--learners.0.gamma is 'big'", "a number"),
+        ("train td3 Pendulum-v1 --config nowhere.toml", "--config nowhere.toml", "No such file"),
         ("train td3 Hoper-v5", "no task 'Hoper-v5'", "did you mean 'Hopper-v5'?"),
         ("train td3 Pendulum-v1 --preset td4", "td3 has no presets", ""),
         (f"{TRAIN} --seeds 0", "--seeds is 0: it must be at least 1", ""),
@@ -487,6 +500,48 @@ def test_what_resume_is_told_reaches_the_loop(credo, seeds, run, monkeypatch):
     code, _, err = credo(f"resume {run} --set mutation.strngth=0.5")
     assert code == 2
     assert "did you mean 'strength'?" in err
+
+
+def test_a_seed_or_a_budget_is_no_setting(credo, run):
+    for change, told in (("seed=3", "start another"), ("frames=1e6", "a budget is a flag")):
+        code, _, err = credo(f"resume {run} --set {change}")
+        assert code == 2
+        assert told in err
+
+
+def test_all_settings_are_written_and_read(credo, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = "train cerl Pendulum-v1 --gamma 0.7 --learners.1.gamma 0.9 --manager thompson"
+    words += " --hidden 4,5 --seed 7 --frames 1e3 --kwargs g=5.0 --learners td3,sac --workers 3"
+    code, saved, _ = credo(f"{words} --print-config")
+    assert code == 0
+    settings = tomllib.loads(saved)
+    told = {"learners.0.gamma": 0.7, "learners.1.gamma": 0.9, "manager": "thompson", "seed": 7}
+    told |= {"network.hidden": [4, 5], "frames": 1000, "kwargs": ["g=5.0"], "learners": "td3,sac"}
+    assert told.items() <= settings.items()
+    pathlib.Path("run.toml").write_text(saved)
+    assert credo("train --config run.toml --print-config") == (0, saved, "")
+    _, other, _ = credo("train cerl --config run.toml --gamma 0.5 --seed 8 --print-config")
+    changed = {name for name, value in tomllib.loads(other).items() if settings[name] != value}
+    assert changed == {"learners.0.gamma", "learners.1.gamma", "seed"}
+    pathlib.Path("own.toml").write_text("[network]\nhidden = [3]\n[learner.critic]\nhidden = 2\n")
+    _, nested, _ = credo("train td3 Pendulum-v1 --config own.toml --print-config")
+    assert tomllib.loads(nested)["network.hidden"] == [3]
+    assert tomllib.loads(nested)["learner.critic.hidden"] == [2]
+    pathlib.Path("wrong.toml").write_text("gama = 3\n")
+    code, _, err = credo("train td3 Pendulum-v1 --config wrong.toml")
+    assert code == 2
+    assert "no flag '--gama'" in err
+    assert "'--gamma'?" in err
+    assert list(tmp_path.glob("runs*")) == []
+
+
+def test_the_best_policy_can_be_asked_for(credo, run, tmp_path):
+    for flag, name in (("", "champion"), ("--best", "best")):
+        assert credo(f"evaluate {run} --episodes 20 {flag}")[0] == 0
+        target = tmp_path / f"{name}.safetensors"
+        assert credo(f"export {run} {target} {flag}")[0] == 0
+    assert (tmp_path / "best.safetensors").exists()
 
 
 def test_every_algorithm_is_made_of_its_preset():

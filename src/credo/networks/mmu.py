@@ -43,7 +43,8 @@ class MMU(AbstractNetwork):
     memory: int | None = eqx.field(static=True, default=None)
     """Memory cells, at least 1; None: as many as hidden."""
     alpha: float = eqx.field(static=True, default=0.0)
-    """Share of the memory that an update replaces, in [0, 1]; 0: an update is added."""
+    """In [0, 1]. 0: what is written is added to memory; 1: it takes the place of as much as the
+    write gate opens; between: a mixture."""
     encoder: Literal["identity", "learned"] = eqx.field(static=True, default="identity")
     """What writes to memory: the hidden activations, or a learned matrix of them."""
     decoder: Literal["identity", "learned"] = eqx.field(static=True, default="identity")
