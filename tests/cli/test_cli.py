@@ -139,7 +139,7 @@ def test_list_names_everything(credo):
         ("train td3 Pendulum-v1 --network lstmm", "no network 'lstmm'", "did you mean 'lstm'?"),
         ("train erl Pendulum-v1 --preset as-coded", "no preset 'as-coded' of erl", "one of: ours"),
         ("train cerl Pendulum-v1 --manager thomson", "no manager 'thomson'", "'thompson'?"),
-        ("train erl Pendulum-v1 --gamma big", "--learners.0.gamma is 'big'", "a number"),
+        ("train erl Pendulum-v1 --gamma big", "--learners.0.gamma is 'big'", "it must be float"),
         ("train td3 Pendulum-v1 --config nowhere.toml", "--config nowhere.toml", "No such file"),
         ("train td3 Hoper-v5", "no task 'Hoper-v5'", "did you mean 'Hopper-v5'?"),
         ("train td3 Pendulum-v1 --preset td4", "td3 has no presets", ""),

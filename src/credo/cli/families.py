@@ -3,11 +3,10 @@
 import dataclasses
 import itertools
 import types
-import typing
-from collections.abc import Iterator
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from .names import CATALOGUE, fail, load, of_user
+from .values import leaves
 
 
 class Family(NamedTuple):
@@ -61,15 +60,6 @@ def family_of(kind: Any) -> Family | None:
         makers |= CATALOGUE["families"].get(base.__name__, {} if abstract else own)
     family = Family(makers, bases, tuple in kinds, tuple in kinds or types.NoneType in kinds)
     return family if makers and len(family.words) > 1 else None
-
-
-def leaves(kind: Any) -> Iterator[Any]:
-    """The types in a type, and `tuple`, `dict` and `Literal` for containers and choices."""
-    origin = typing.get_origin(kind)
-    if origin in (None, tuple, dict, Literal):
-        yield origin or kind
-    for inside in () if origin is Literal else typing.get_args(kind):
-        yield from leaves(inside)
 
 
 def _path(cls: type) -> str:

@@ -51,10 +51,8 @@ def of_user(name: str, call: Callable[[], Any] | None = None) -> Any:
     except ImportError as error:
         fail(f"cannot import {name!r}: {error}. Start credo in the folder of its file")
     except SystemExit as error:
-        fail(
-            f"cannot import {module} of {name}: {ending.place(error)} ends Python (exit code "
-            f"{error.code!r}): put that under if __name__ == '__main__'"
-        )
+        ends = f"{ending.place(error)} ends Python (exit code {error.code!r})"
+        fail(f"cannot import {module} of {name}: {ends}: put that under if __name__ == '__main__'")
     except Exception as error:
         place, what = ending.place(error), f"{type(error).__name__}: {ending.first(error)}"
         if place or not (isinstance(error, TypeError) and isinstance(call, type)):

@@ -83,7 +83,9 @@ def _own(name: str, kwargs: dict[str, Any]) -> Any:
     found = of_user(name)
     module, _, missing = name.partition(":")
     if found is None:
-        fail(f"cannot import {name!r}: {module} has no {missing}. Start credo where its file is")
+        fail(
+            f"cannot import {name!r}: {module} has no {missing}. Start credo in the folder of its file"
+        )
     if isinstance(found, type) and issubclass(found, AbstractEnvironment | AbstractHostEnvironment):
         return of_user(name, found)
     kind = of_user(name, lambda: names.kind_of(name, kwargs))

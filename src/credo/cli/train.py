@@ -2,7 +2,6 @@
 
 import dataclasses
 import pathlib
-import sys
 from typing import Any
 
 from ..runs.ending import say
@@ -61,8 +60,7 @@ def run(line: Line) -> None:
     if command.algorithm and command.algorithm not in ALGORITHMS:
         fail(f"no algorithm {command.algorithm!r}", command.algorithm, ALGORITHMS)
     if not (command.task or (line.help and command.algorithm)):
-        line.show()
-        sys.exit(0 if line.help else 2)
+        line.end()
     algorithm = _algorithm(line, command)
     line.done()
     from . import tasks
