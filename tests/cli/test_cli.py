@@ -18,7 +18,7 @@ import pytest
 from jax.errors import JaxRuntimeError
 
 from credo import cli, require
-from credo.cli import train
+from credo.cli import tasks, train
 from credo.cli.line import Line
 from credo.cli.names import ALGORITHMS, COMMANDS, NETWORKS, TASKS, load
 from credo.environments.gymnasium import Gymnasium
@@ -497,6 +497,9 @@ def test_what_resume_is_told_reaches_the_loop(credo, seeds, run, monkeypatch):
         assert fields["set"] == {"mutation.strength": 0.5, "episodes": 5}
         assert (fields["trust"], fields["without_replay"]) == (True, True)
     assert told[0][1]["wall_clock"] == 120.0
+    told.clear()
+    assert credo(f"resume {run} --set mutation-strength=0.25 --set elite_fraction=0.3")[0] == 0
+    assert told[0][1]["set"] == {"mutation.strength": 0.25, "elite_fraction": 0.3}
     code, _, err = credo(f"resume {run} --set mutation.strngth=0.5")
     assert code == 2
     assert "did you mean 'strength'?" in err
@@ -534,6 +537,39 @@ def test_all_settings_are_written_and_read(credo, tmp_path, monkeypatch):
     assert "no flag '--gama'" in err
     assert "'--gamma'?" in err
     assert list(tmp_path.glob("runs*")) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'algorithm = "td3"\ntask = "shutil:rmtree"\nkwargs = ["path=kept"]',
+        'learner = "stranger_1:Learner"',
+        'task = "stranger_1.team"',
+        'rewards = ["global=stranger_1:pay"]',
+        'kwargs = ["task=stranger_1:f"]',
+        'trust = true\nlearner = "stranger_1:Learner"',
+    ],
+)
+def test_a_file_of_settings_names_no_code_without_trust(credo, tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "stranger_1.py").write_text("open('begun', 'w')")
+    (tmp_path / "run.toml").write_text(text)
+    words = "" if text.startswith("algorithm") else "td3 Pendulum-v1"
+    code, _, err = credo(f"train {words} --config run.toml")
+    assert code == 2
+    told = "maybe code of others: look into it, and give --trust"
+    assert ("for the command line alone" if "trust =" in text else told) in err
+    assert (tmp_path / "kept").exists()
+    assert not (tmp_path / "begun").exists()
+
+
+def test_the_rewards_of_a_task_are_named():
+    env = tasks.task("rover", {}, ("difference", "global"))
+    assert env.rewards == ("difference", "global")
+    line = Line("train", ["merl", "rover", "--rewards", "global,local,dpp", "--coupling", "2"])
+    env = train._algorithm(line, line.command(train.Train)).env
+    assert (env.rewards, env.coupling) == (("global", "local", "dpp"), 2)
 
 
 def test_the_best_policy_can_be_asked_for(credo, run, tmp_path):

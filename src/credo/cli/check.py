@@ -15,8 +15,9 @@ class Check:
     _: dataclasses.KW_ONLY
     kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
     """NAME=VALUE …: what a task of Gymnasium or PettingZoo is made with."""
-    rewards: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """NAME=MODULE:FUNCTION …: rewards of your own, of a team of PettingZoo."""
+    rewards: tuple[str, ...] = ()
+    """Rewards of the task by name, the first is what training maximises; of a team of PettingZoo
+    NAME=MODULE:FUNCTION …, rewards of your own. None given: the task's own."""
 
 
 def run(line: Line) -> None:
@@ -27,9 +28,7 @@ def run(line: Line) -> None:
     from . import tasks
 
     line.skipped = {"id"}  # the task is a word
-    env = line.take(
-        tasks.task(command.task, kwargs=command.kwargs, rewards=command.rewards), "env."
-    )
+    env = line.take(tasks.task(command.task, command.kwargs, command.rewards), "env.")
     line.done()
     if isinstance(env, AbstractHostEnvironment):
         say(f"{command.task}: it is opened and plays for {checks.HOST_SECONDS:g} seconds, at most")

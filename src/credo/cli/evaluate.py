@@ -56,7 +56,7 @@ def _task(line: Line, env: Any, kwargs: dict[str, Any]) -> Any:
     """A run's task with what was typed, if its policy can act there."""
     from .tasks import with_settings
 
-    task = line.take(with_settings(env, kwargs=kwargs), "env.")
+    task = line.take(with_settings(env, kwargs), "env.")
     if task != env and task.sizes != env.sizes:
         words = ("numbers in an observation", "numbers in an action", "agents")
         sizes = zip(words, task.sizes, env.sizes, strict=False)  # who plays alone has two

@@ -20,7 +20,7 @@ from .values import leaves, plain, read, split, typed
 
 TOKEN = re.compile(r"--([^\W\d][^=]*)(?:=(.*))?", re.DOTALL)
 LETTERS = {"-h": "--help", "-o": "--output"}
-OPEN = re.compile(r"((env|options)\.)+")  # fields of these need no prefix
+OPEN = re.compile(r"((env|options|breeder)\.)+")  # fields of these need no prefix
 CHOSEN = ("env", "network", "options")  # by words and flags of the command
 
 
@@ -38,7 +38,7 @@ class Flag(NamedTuple):
         choices = typing.get_args(self.kind) if typing.get_origin(self.kind) is Literal else ()
         value = ",".join(map(str, self.value)) if isinstance(self.value, tuple) else self.value
         told = f"{text} ({', '.join(map(str, choices))})" if choices else text
-        lines = textwrap.wrap(f"{told} [{value}]", 72)
+        lines = textwrap.wrap(told if value in ("", {}) else f"{told} [{value}]", 72)
         return f"  --{self.name:<22} " + f"\n{' ' * 27}".join(lines)
 
 
@@ -66,9 +66,9 @@ class Line:
         """The command: fields that are not keyword-only are words, the others flags."""
         words = [f for f in dataclasses.fields(cls) if not f.kw_only]
         needed = sum(f.default is dataclasses.MISSING for f in words)
-        names = [f.name.upper() for f in words]
-        names[needed:] = [f"[{name}]" for name in names[needed:]]
-        self.prog, self.text = " ".join((self.prog, *names)), " ".join((cls.__doc__ or "").split())
+        names = [f"[{f.name.upper()}]" if f.default is None else f.name.upper() for f in words]
+        self.prog = " ".join((self.prog, *self.words, *names[len(self.words) :]))
+        self.text = " ".join((cls.__doc__ or "").split())
         self.skipped = {f.name for f in words}
         try:
             command = self.take(cls(*[None] * needed))
@@ -133,7 +133,8 @@ class Line:
         found: dict[str, Flag] = {}
         for flag in self.flags.values():
             for name in shorts(flag.path) - found.keys():
-                found[name] = flag._replace(name=name, path="")
+                text = CATALOGUE["short"][name][0]
+                found[name] = flag._replace(name=name, path="", text=text)
         return found | {flag.name: flag for flag in self.flags.values()}
 
     def done(self) -> None:
@@ -155,13 +156,14 @@ class Line:
         if self.help == "help-all" or len(known) < 20:
             groups = {name: flag.path.rpartition(".")[0] for name, flag in known.items()}
             for title in dict.fromkeys(groups.values()):
-                print(*[f"\n{title}"] * (title not in ("", "options")))
+                if title not in ("", "options"):
+                    print(f"\n{title}")
                 print(
                     *[f.help(f.text) for f in known.values() if groups[f.name] == title], sep="\n"
                 )
         else:
             for flag in [known[name] for name in CATALOGUE["screen"]["first"] if name in known]:
-                print(flag.help(re.split(r"(?<=\w)[.:;] ", flag.text)[0]))
+                print(flag.help(re.split(r"(?<=[\w`)\]])[.:;] ", flag.text)[0]))
             print(f"\n--help-all lists every field: {len(known)} flags.")
         raise SystemExit(0 if self.help else 2)
 
@@ -169,7 +171,7 @@ class Line:
 def shorts(path: str) -> set[str]:
     """The short names that stand for a field."""
     table = CATALOGUE["short"].items()
-    return {name for name, paths in table if any(fnmatch.fnmatch(path, p) for p in paths)}
+    return {name for name, (_, *paths) in table if any(fnmatch.fnmatch(path, p) for p in paths)}
 
 
 def _kinds(cls: type) -> dict[str, Any]:

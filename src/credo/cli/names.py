@@ -31,8 +31,9 @@ def fail(
     that may have been meant, but are too many to be listed."""
     ending.say(f"credo: {message}")
     known = list(known)
-    if close := difflib.get_close_matches(given, [*known, *more], n=1, cutoff=0.5):
-        ending.say(f"       did you mean {close[0]!r}?")
+    if close := difflib.get_close_matches(given, [*known, *more], cutoff=0.5):
+        meant = next((name for name in close if given.startswith(name)), close[0])
+        ending.say(f"       did you mean {meant!r}?")
     elif known:
         ending.say(f"       choose one of: {', '.join(known)}")
     raise SystemExit(2)

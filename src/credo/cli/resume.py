@@ -5,7 +5,7 @@ import pathlib
 from typing import Any
 
 from ..runs.options import RunOptions
-from .line import Line
+from .line import Line, shorts
 from .names import fail
 
 BEGUN = {"seed": "a run's seed stays: start another with `credo train`"}
@@ -37,8 +37,10 @@ def run(line: Line) -> None:
     for name in command.set.keys() & BEGUN.keys():
         fail(f"--set {name}: {BEGUN[name]}")
     for path in runs if command.set else ():  # nothing was begun yet
+        algorithm = Run(path, trust=command.trust).algorithm
+        command.set = _in_full(algorithm, command.set)
         try:
-            config.replaced(Run(path, trust=command.trust).algorithm, command.set)
+            config.replaced(algorithm, command.set)
         except ValueError as error:
             fail(f"--set: {error}")
     again: Any = {name: getattr(command, name) for name in ("set", "trust", "without_replay")}
@@ -49,3 +51,14 @@ def run(line: Line) -> None:
         local.run(jobs, title=pathlib.Path(command.run).name)
     for path in runs:
         print(Run(path, trust=command.trust).summary)
+
+
+def _in_full(algorithm: Any, changes: dict[str, Any]) -> dict[str, Any]:
+    """Changes by the paths of fields, which short names such as gamma stand for."""
+    line = Line("resume", [])
+    line.take(algorithm)
+    meant = {
+        name: [path for path in line.flags if name.replace("_", "-") in shorts(path)]
+        for name in changes.keys() - line.flags.keys()
+    }
+    return {path: x for name, x in changes.items() for path in meant.get(name) or [name]}

@@ -2,21 +2,34 @@
 
 import json
 import pathlib
+import re
 import tomllib
 from typing import Any
 
+from ..environments.names import OWN_TEAMS
 from .line import Line
 from .names import fail
 
-OWN = ("config", "save_config", "print_config")  # about the file itself
+OWN = ("config", "save_config", "print_config", "trust")  # about the file itself
 
 
-def read(path: str) -> list[tuple[str, list[str]]]:
-    """Flags as if they were typed. Tables may be nested: `[learner]`, `gamma = 0.9`."""
+def read(path: str, *, trust: bool) -> list[tuple[str, list[str]]]:
+    """Flags as if they were typed. Tables may be nested: `[learner]`, `gamma = 0.9`. Whoever wrote
+    the file is not who typed its name: without `trust`, what names code of others is refused."""
     try:
-        return list(_flat(tomllib.loads(pathlib.Path(path).read_text("utf-8")), ""))
+        found = list(_flat(tomllib.loads(pathlib.Path(path).read_text("utf-8")), ""))
     except (OSError, ValueError) as error:
         fail(f"--config {path}: {error}")
+    for name, values in found:
+        if name.replace("-", "_") in OWN:
+            fail(f"{path} sets --{name}, which is for the command line alone")
+        for value in values if not trust else ():
+            team = name == "task" and "." in value and not value.startswith(OWN_TEAMS)
+            if team or re.search(r"\w:\w", value):
+                fail(
+                    f"{path} names {value!r}, maybe code of others: look into it, and give --trust"
+                )
+    return found
 
 
 def _flat(table: dict[str, Any], prefix: str):

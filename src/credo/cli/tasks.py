@@ -15,26 +15,31 @@ from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..environments.pettingzoo import PettingZoo
 from ..runs.ending import first, say
 from .names import CATALOGUE, TASKS, fail, load, of_user
+from .values import pairs
 
 KINDS = {"gymnasium": Gymnasium, "pettingzoo": PettingZoo}
 
 
-def task(name: str, *, kwargs: dict[str, Any], rewards: dict[str, Any]) -> Any:
-    """A task with its defaults, made with `kwargs`, with `rewards` of one's own."""
-    return with_settings(_named(name, kwargs), kwargs=kwargs, rewards=rewards)
+def task(name: str, kwargs: dict[str, Any], rewards: tuple[str, ...]) -> Any:
+    """A task with its defaults, made with `kwargs`; `rewards` as in `with_settings`."""
+    return with_settings(_named(name, kwargs), kwargs, rewards)
 
 
-def with_settings(env: Any, **settings: dict[str, Any]) -> Any:
-    """A task with other `kwargs` and `rewards`; what is not named stays."""
-    known = {f.name for f in dataclasses.fields(env)}
-    given = {name: x for name, x in settings.items() if x}
-    if not given:
+def with_settings(env: Any, kwargs: dict[str, Any], rewards: tuple[str, ...] = ()) -> Any:
+    """A task that is made with other `kwargs`, those that are not named stay; with other `rewards`:
+    names of a task's own ones, or NAME=MODULE:FUNCTION for a team of PettingZoo."""
+    if not (kwargs or rewards):
         return env
-    if "env" in known and not given.keys() & known:  # a wrapper
-        return dataclasses.replace(env, env=with_settings(env.env, **given))
-    for name in given.keys() - known:
+    known, new = {f.name for f in dataclasses.fields(env)}, {}
+    if "env" in known and "kwargs" not in known:  # a wrapper
+        return dataclasses.replace(env, env=with_settings(env.env, kwargs, rewards))
+    for name in {name for name, x in (("kwargs", kwargs), ("rewards", rewards)) if x} - known:
         fail(f"{type(env).__name__} has no --{name}: its settings are flags, see --help-all")
-    new = {name: dict(getattr(env, name) or ()) | given[name] for name in given}
+    if kwargs:
+        new["kwargs"] = dict(env.kwargs) | kwargs
+    if rewards:
+        own = isinstance(env, PettingZoo)
+        new["rewards"] = dict(env.rewards) | pairs("rewards", [*rewards]) if own else rewards
     return dataclasses.replace(env, **new)
 
 
@@ -83,9 +88,8 @@ def _own(name: str, kwargs: dict[str, Any]) -> Any:
     found = of_user(name)
     module, _, missing = name.partition(":")
     if found is None:
-        fail(
-            f"cannot import {name!r}: {module} has no {missing}. Start credo in the folder of its file"
-        )
+        why = f"{module} has no {missing}"
+        fail(f"cannot import {name!r}: {why}. Start credo in the folder of its file")
     if isinstance(found, type) and issubclass(found, AbstractEnvironment | AbstractHostEnvironment):
         return of_user(name, found)
     kind = of_user(name, lambda: names.kind_of(name, kwargs))

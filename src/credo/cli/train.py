@@ -6,14 +6,8 @@ from typing import Any
 
 from ..runs.ending import say
 from ..runs.options import RunOptions
-from . import settings
 from .line import Line
-from .names import ALGORITHMS, NETWORKS, fail, load
-
-ONE, EXAMPLES = (
-    "environments.probes:Copy",
-    {"a team": "environments.probes:Meet", "labelled sequences": "environments.probes:Remember"},
-)
+from .names import ALGORITHMS, CATALOGUE, NETWORKS, fail, load
 
 
 @dataclasses.dataclass
@@ -34,11 +28,13 @@ class Train:
     path: str | None = None  # the run's folder; None: runs/ALGORITHM-TASK-SEED
     kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
     """NAME=VALUE …: what a task of Gymnasium or PettingZoo is made with."""
-    rewards: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """NAME=MODULE:FUNCTION …: rewards of your own, of a team of PettingZoo."""
+    rewards: tuple[str, ...] = ()
+    """Rewards of the task by name, the first is what training maximises; of a team of PettingZoo
+    NAME=MODULE:FUNCTION …, rewards of your own. None given: the task's own."""
     config: str | None = None  # TOML file with any of these settings; what is typed comes first
     save_config: str | None = None  # TOML file to write all settings to; None: none
     print_config: bool = False  # print all settings as TOML and train nothing
+    trust: bool = False  # the file of --config names code of others: import it
     options: RunOptions = RunOptions()  # noqa: RUF009
 
     def __post_init__(self):
@@ -52,7 +48,10 @@ class Train:
 def run(line: Line) -> None:
     """Train, or say with which flags."""
     if files := [values for name, values in line.given if name == "config" and values]:
-        line.filed = settings.read(files[-1][0])
+        from . import settings
+
+        trust = any(name == "trust" for name, _ in line.given)
+        line.filed = settings.read(files[-1][0], trust=trust)
         saved = dict(line.filed)
         words = [*saved.get("algorithm", []), *saved.get("task", [])]
         line.words, line.used = line.words + words[len(line.words) :], {"algorithm", "task"}
@@ -63,7 +62,7 @@ def run(line: Line) -> None:
         line.end()
     algorithm = _algorithm(line, command)
     line.done()
-    from . import tasks
+    from . import settings, tasks
 
     tasks.require_sound(command.task, algorithm.env)
     text = settings.written(command, algorithm)
@@ -92,10 +91,10 @@ def _algorithm(line: Line, command: Train) -> Any:
         build = cls.presets()[command.preset]
     line.reserved |= {f.name.replace("_", "-") for f in dataclasses.fields(cls)}
     line.skipped = {"id"}  # the task is a word
-    example = EXAMPLES.get(entry.get("learns", ""), ONE)
+    example = CATALOGUE["examples"][entry.get("learns", "one agent")]
     try:
-        given = {"kwargs": command.kwargs, "rewards": command.rewards}
-        env = tasks.task(command.task, **given) if command.task else load(example)()
+        given = (command.task, command.kwargs, command.rewards)
+        env = tasks.task(*given) if command.task else load(example)()
         env = line.take(env, "env.")
         if entry.get("learns") == "a team" and env.agents is None:
             fail(
@@ -132,15 +131,13 @@ def _start(command: Train, algorithm: Any) -> None:
     from ..runs import folder, loop
     from ..runs.store import Run
 
-    frames, start = command.options.frames, getattr(algorithm, "start_frames", None)
-    start = (
-        getattr(algorithm, "warmup_frames", start) if getattr(algorithm, "learners", 1) else None
-    )
-    if None not in (start, frames) and frames <= start and not command.from_:
+    frames, learns = command.options.frames, getattr(algorithm, "learners", True)
+    flag = next((x for x in ("start_frames", "warmup_frames") if hasattr(algorithm, x)), "")
+    start = getattr(algorithm, flag, -1)
+    if learns and not command.from_ and frames is not None and frames <= start:
         say(
             f"credo: note: nothing is learned by gradient in the first {start:,} frames, and this "
-            f"run ends after {frames:,}: give more --frames, or fewer --start-frames or "
-            "--warmup-frames"
+            f"run ends after {frames:,}: give more --frames, or fewer --{flag.replace('_', '-')}"
         )
     number = command.seed if command.seeds == 1 else "seeds"
     path = pathlib.Path(command.path) if command.path else folder.free_name(algorithm, number)
