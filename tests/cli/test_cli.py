@@ -11,14 +11,19 @@ import subprocess
 import sys
 import tempfile
 import textwrap
+import tomllib
 import warnings
 
 import pytest
 from jax.errors import JaxRuntimeError
 
 from credo import cli, require
+from credo.cli import tasks, train
+from credo.cli.line import Line
+from credo.cli.names import ALGORITHMS, COMMANDS, NETWORKS, TASKS, load
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Meet, Remember
+from credo.experiments.catalogue import EXPERIMENTS
 from credo.networks.mlp import MLP
 from credo.networks.team import Team
 from credo.runs.loop import Interrupted
@@ -91,14 +96,14 @@ def test_what_only_informs_imports_no_jax(words):
 def test_help_names_every_command(credo):
     code, out, err = credo("--help")
     assert (code, err) == (0, "")
-    for command in cli.COMMANDS:
+    for command in COMMANDS:
         assert f"\n  {command} " in out
 
 
 def test_list_names_everything(credo):
     code, out, _ = credo("list")
     assert code == 0
-    for names in (cli.TASKS, cli.ALGORITHMS, cli.NETWORKS, cli.EXPERIMENTS):
+    for names in (TASKS, ALGORITHMS, NETWORKS, EXPERIMENTS):
         for name in names:
             assert f"\n  {name} " in out
     assert "fig-3.4a" not in credo("list tasks")[1]
@@ -108,7 +113,7 @@ def test_list_names_everything(credo):
     ("words", "complaint", "help"),
     [
         ("trian", "no command 'trian'", "did you mean 'train'?"),
-        ("dance", "no command 'dance'", "choose one of: list, train"),
+        ("dance", "no command 'dance'", "choose one of: train, resume"),
         ("list task", "nothing called 'task'", "did you mean 'tasks'?"),
         ("train evolution sequence-recall", "no algorithm 'evolution'", "did you mean 'neuroevol"),
         ("train neuroevolution sequence-recal", "no task 'sequence-recal'", "'sequence-recall'?"),
@@ -122,10 +127,22 @@ def test_list_names_everything(credo):
         ("train neuroevolution sequence-recall --network", "--network needs a value", ""),
         (f"{TRAIN} --wall-clock soon", "wall-clock is 'soon'", "90s, 30m or 2h"),
         (f"{TRAIN} --depth 0", "depth is 0: it must be at least 1", ""),
-        (f"{TRAIN} --generations 0", "--generations is 0: it must be at least 1", ""),
-        (f"{TRAIN} --frames 0", "--frames is 0: it must be at least 1", ""),
+        (f"{TRAIN} --generations 0", "--generations is 0: it must lie in [1, ", ""),
+        (f"{TRAIN} --frames 0", "--frames is 0: it must lie in [1, ", ""),
+        ("td3 Pendulum-v1", "td3 is an algorithm: credo train td3 TASK", ""),
+        ("train merl Pendulum-v1", "merl trains teams", "or train erl"),
+        ("train td3 ALE/Pong-v5", "a task of ale-py: pip install ale-py", "ale_py:ALE/Pong-v5"),
+        ("train td3 my.Env", "no module 'my.Env'", "is written my:Env"),
+        ("train td3 Pendulum-v1 --id Hopper-v5", "no flag '--id'", "the task is a word"),
+        ("check Pendulum-v1 --id Hopper-v5", "no flag '--id'", "the task is a word"),
+        ("train td3 Pendulum-v1 --name x", "no flag '--name'", "it is called --path"),
+        ("train td3 Pendulum-v1 --network lstmm", "no network 'lstmm'", "did you mean 'lstm'?"),
+        ("train erl Pendulum-v1 --preset as-coded", "no preset 'as-coded' of erl", "one of: ours"),
+        ("train cerl Pendulum-v1 --manager thomson", "no manager 'thomson'", "'thompson'?"),
+        ("train erl Pendulum-v1 --gamma big", "--learners.0.gamma is 'big'", "it must be float"),
+        ("train td3 Pendulum-v1 --config nowhere.toml", "--config nowhere.toml", "No such file"),
         ("train td3 Hoper-v5", "no task 'Hoper-v5'", "did you mean 'Hopper-v5'?"),
-        ("train td3 Pendulum-v1 --preset td4", "no preset 'td4' of td3", "'td3'?"),
+        ("train td3 Pendulum-v1 --preset td4", "td3 has no presets", ""),
         (f"{TRAIN} --seeds 0", "--seeds is 0: it must be at least 1", ""),
         (f"{TRAIN} --keep 0", "--keep is 0: it must be at least 1", ""),
         (f"{TRAIN} --seed -1", "--seed is -1: a seed must lie in 0 … 4294967295", ""),
@@ -140,8 +157,8 @@ def test_list_names_everything(credo):
         ("check Pendulum-v1 --kwargs 1=g", "--kwargs: '1=g' is no setting", "NAME=VALUE"),
         ("check Pendulum-v1 --kwargs g=[1]", "a number, a string, a bool, None or a tuple", ""),
         ("resume nowhere --keep 0", "--keep is 0: it must be at least 1", ""),
-        ("resume nowhere --generations 0", "--generations is 0: it must be at least 1", ""),
-        ("resume nowhere --set gamma", "--set is 'gamma'", "as learner.actor_lr=1e-4"),
+        ("resume nowhere --generations 0", "--generations is 0: it must lie in [1, ", ""),
+        ("resume nowhere --set gamma", "--set: gamma has no value", "write gamma=VALUE"),
         ("watch nowhere --episodes 0", "--episodes is 0: it must be at least 1", ""),
         ("watch nowhere --seed -1", "a seed must lie in 0 … 4294967295", ""),
         ("watch nowhere --fps 0", "--fps is 0.0: it must be more than 0", ""),
@@ -234,14 +251,14 @@ def raising(error):
     ],
 )
 def test_whatever_a_command_raises_ends_in_one_line(credo, monkeypatch, command, code, told):
-    monkeypatch.setattr(cli, "_list", command)
+    monkeypatch.setattr("credo.cli.list.run", command)
     ended, out, err = credo("list")
     assert (ended, out, len(err.splitlines())) == (code, "", 1)
     assert told in err
 
 
 def test_what_nobody_foresaw_leaves_its_traceback(credo, monkeypatch, tmp_path):
-    monkeypatch.setattr(cli, "_list", user_error)
+    monkeypatch.setattr("credo.cli.list.run", user_error)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     _, _, err = credo("list")
     (log,) = tmp_path.iterdir()
@@ -251,7 +268,7 @@ def test_what_nobody_foresaw_leaves_its_traceback(credo, monkeypatch, tmp_path):
 
 
 def test_what_a_file_says_moves_no_cursor(credo, monkeypatch):
-    monkeypatch.setattr(cli, "_list", raising(RunError("\x1b[2Jclean")))
+    monkeypatch.setattr("credo.cli.list.run", raising(RunError("\x1b[2Jclean")))
     assert credo("list")[2] == "credo: \\x1b[2Jclean\n"
 
 
@@ -295,7 +312,7 @@ def test_a_command_without_its_argument_shows_its_usage(credo, command):
 
 
 def test_every_flag_is_listed_with_its_meaning_and_default(credo):
-    code, out, _ = credo("train neuroevolution sequence-classification --help")
+    code, out, _ = credo("train neuroevolution sequence-classification --help-all")
     assert code == 0
     for flag in ("--depth", "--network.hidden", "--mutation.strength", "--generations"):
         assert flag in out
@@ -320,9 +337,9 @@ def test_a_preset_can_be_overridden_by_flags():
     from credo.networks.mmu import MMU
 
     argv = ["--depth", "5", "--episodes", "7", "--mutation.strength", "0.3", "--seed", "4"]
-    algorithm, options = cli._configured(
-        "credo train", Neuroevolution.ours, SequenceClassification(), MMU(), argv
-    )
+    line = Line("train", ["neuroevolution", "sequence-classification", "--preset", "ours", *argv])
+    options = line.command(train.Train)
+    algorithm = train._algorithm(line, options)
     expected = Neuroevolution.ours(SequenceClassification(depth=5), MMU(), episodes=7)
     mutation = dataclasses.replace(expected.mutation, strength=0.3)
     assert type(algorithm) is Neuroevolution
@@ -468,34 +485,112 @@ def test_every_run_of_a_folder_is_resumed(credo, seeds, monkeypatch):
 
 def test_what_resume_is_told_reaches_the_loop(credo, seeds, run, monkeypatch):
     told = []
-    resumed = lambda path, options, **again: told.append((path, options, again))  # noqa: E731
+    resumed = lambda path, options, **fields: told.append((path, fields | vars(options)))  # noqa: E731
     monkeypatch.setattr("credo.runs.loop.resume", resumed)
-    sent = lambda jobs, **_: [resumed(job.path, job.options, **job.again) for job in jobs]  # noqa: E731
-    monkeypatch.setattr("credo.executors.local.run", sent)
+    given = lambda jobs, **_: told.extend((j.path, j.again | vars(j.options)) for j in jobs)  # noqa: E731
+    monkeypatch.setattr("credo.executors.local.run", given)
     words = "--set mutation.strength=0.5 --set episodes=5 --trust --without-replay"
     assert credo(f"resume {run} {words} --wall-clock 2m")[0] == 0
     assert credo(f"resume {seeds} {words}")[0] == 0
-    paths = [run, *sorted(pathlib.Path(seeds).glob("*"), reverse=True)]
-    assert [path for path, *_ in told] == paths
-    for _, _, fields in told:
+    assert [path for path, _ in told] == [run, *sorted(pathlib.Path(seeds).glob("*"), reverse=True)]
+    for _, fields in told:
         assert fields["set"] == {"mutation.strength": 0.5, "episodes": 5}
         assert (fields["trust"], fields["without_replay"]) == (True, True)
-    assert told[0][1].wall_clock == 120.0
+    assert told[0][1]["wall_clock"] == 120.0
+    told.clear()
+    assert credo(f"resume {run} --set mutation-strength=0.25 --set elite_fraction=0.3")[0] == 0
+    assert told[0][1]["set"] == {"mutation.strength": 0.25, "elite_fraction": 0.3}
     code, _, err = credo(f"resume {run} --set mutation.strngth=0.5")
     assert code == 2
     assert "did you mean 'strength'?" in err
 
 
+def test_a_seed_or_a_budget_is_no_setting(credo, run):
+    for change, told in (("seed=3", "start another"), ("frames=1e6", "a budget is a flag")):
+        code, _, err = credo(f"resume {run} --set {change}")
+        assert code == 2
+        assert told in err
+
+
+def test_all_settings_are_written_and_read(credo, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = "train cerl Pendulum-v1 --gamma 0.7 --learners.1.gamma 0.9 --manager thompson"
+    words += " --hidden 4,5 --seed 7 --frames 1e3 --kwargs g=5.0 --learners td3,sac --workers 3"
+    code, saved, _ = credo(f"{words} --print-config")
+    assert code == 0
+    settings = tomllib.loads(saved)
+    told = {"learners.0.gamma": 0.7, "learners.1.gamma": 0.9, "manager": "thompson", "seed": 7}
+    told |= {"network.hidden": [4, 5], "frames": 1000, "kwargs": ["g=5.0"], "learners": "td3,sac"}
+    assert told.items() <= settings.items()
+    pathlib.Path("run.toml").write_text(saved)
+    assert credo("train --config run.toml --print-config") == (0, saved, "")
+    _, other, _ = credo("train cerl --config run.toml --gamma 0.5 --seed 8 --print-config")
+    changed = {name for name, value in tomllib.loads(other).items() if settings[name] != value}
+    assert changed == {"learners.0.gamma", "learners.1.gamma", "seed"}
+    pathlib.Path("own.toml").write_text("[network]\nhidden = [3]\n[learner.critic]\nhidden = 2\n")
+    _, nested, _ = credo("train td3 Pendulum-v1 --config own.toml --print-config")
+    assert tomllib.loads(nested)["network.hidden"] == [3]
+    assert tomllib.loads(nested)["learner.critic.hidden"] == [2]
+    pathlib.Path("wrong.toml").write_text("gama = 3\n")
+    code, _, err = credo("train td3 Pendulum-v1 --config wrong.toml")
+    assert code == 2
+    assert "no flag '--gama'" in err
+    assert "'--gamma'?" in err
+    assert list(tmp_path.glob("runs*")) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'algorithm = "td3"\ntask = "shutil:rmtree"\nkwargs = ["path=kept"]',
+        'learner = "stranger_1:Learner"',
+        'task = "stranger_1.team"',
+        'rewards = ["global=stranger_1:pay"]',
+        'kwargs = ["task=stranger_1:f"]',
+        'trust = true\nlearner = "stranger_1:Learner"',
+    ],
+)
+def test_a_file_of_settings_names_no_code_without_trust(credo, tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "stranger_1.py").write_text("open('begun', 'w')")
+    (tmp_path / "run.toml").write_text(text)
+    words = "" if text.startswith("algorithm") else "td3 Pendulum-v1"
+    code, _, err = credo(f"train {words} --config run.toml")
+    assert code == 2
+    told = "maybe code of others: look into it, and give --trust"
+    assert ("for the command line alone" if "trust =" in text else told) in err
+    assert (tmp_path / "kept").exists()
+    assert not (tmp_path / "begun").exists()
+
+
+def test_the_rewards_of_a_task_are_named():
+    env = tasks.task("rover", {}, ("difference", "global"))
+    assert env.rewards == ("difference", "global")
+    line = Line("train", ["merl", "rover", "--rewards", "global,local,dpp", "--coupling", "2"])
+    env = train._algorithm(line, line.command(train.Train)).env
+    assert (env.rewards, env.coupling) == (("global", "local", "dpp"), 2)
+
+
+def test_the_best_policy_can_be_asked_for(credo, run, tmp_path):
+    for flag, name in (("", "champion"), ("--best", "best")):
+        assert credo(f"evaluate {run} --episodes 20 {flag}")[0] == 0
+        target = tmp_path / f"{name}.safetensors"
+        assert credo(f"export {run} {target} {flag}")[0] == 0
+    assert (tmp_path / "best.safetensors").exists()
+
+
 def test_every_algorithm_is_made_of_its_preset():
     alone = Gymnasium("Pendulum-v1", in_process=True)
     other = {"bptt": Remember()} | dict.fromkeys(("merl", "matd3", "maddpg", "ccea"), Meet())
-    for name, entry in cli.ALGORITHMS.items():
+    for name, entry in ALGORITHMS.items():
         env = other.get(name, alone)
-        build = cli._builder(name, entry.preset)
-        network = None if entry.network is None else MLP()
-        algorithm = build(env, network)
-        assert type(algorithm) is cli._load(entry.path)
+        network = MLP() if "network" in entry else None
+        algorithm = load(entry["path"])(env, network)
+        assert type(algorithm).__name__ in entry["path"]
         assert algorithm.env == env
+        for preset in entry.get("presets", ()):
+            assert preset in type(algorithm).presets()
 
 
 def test_no_command_leaves_a_trace_when_it_is_stopped(credo, monkeypatch, tmp_path):
@@ -554,7 +649,7 @@ def test_it_is_resumed_evaluated_and_started_from(credo, hosted, tmp_path):
 
 
 def test_an_environment_that_fails_ends_in_one_line(credo, own_tasks, tmp_path, monkeypatch):
-    monkeypatch.setattr(cli, "_require_sound", lambda *_: None)  # it would be found out
+    monkeypatch.setattr("credo.cli.tasks.require_sound", lambda *_: None)  # it would be found out
     words = f"train td3 {own_tasks}:Crumbling {OFF_POLICY} --frames 1000 --path {tmp_path / 'run'}"
     code, out, err = credo(words)
     *_, last = err.splitlines()
@@ -692,7 +787,7 @@ def test_a_gymnasium_class_of_ones_own_is_checked_with_its_flags(credo, own_task
     words = f"train td3 {own_tasks}:Crumbling --frames 10"
     code, out, err = credo(words)
     assert (code, out) == (2, "")
-    assert "cannot be trained on before this is mended" in err
+    assert f"fix {own_tasks}:Crumbling before training" in err
     code, out, _ = credo(f"{words} {OFF_POLICY}")  # with --max-episode-steps
     assert code == 0
     assert out.startswith("runs/td3-crumbling-0: generation 1,")
@@ -780,7 +875,7 @@ def test_a_team_of_rovers_is_trained_with_the_flags_of_its_parts(credo, tmp_path
     assert out.startswith(f"{path}: generation 3, best fitness ")
     run = Run(path)
     algorithm = run.algorithm
-    assert type(algorithm) is cli._load("credo.algorithms.merl:MERL")
+    assert type(algorithm) is load("algorithms.merl:MERL")
     env = algorithm.env
     assert (env.agents, env.coupling, env.pois, env.max_steps, env.size) == (3, 2, 2, 4, 8.0)
     assert (algorithm.network.trunk, algorithm.network.sharing) == ((4,), "trunk")
@@ -822,16 +917,18 @@ def test_a_team_of_pettingzoo_is_trained_by_its_name(credo, tmp_path):
 
 
 def test_each_agent_of_a_team_has_a_network_of_its_own():
-    team = cli._on_a_team("neuroevolution", Meet(), MLP())
-    assert team == Team(trunk=(), head=MLP(), sharing="nothing")
-    assert cli._on_a_team("merl", Meet(), team) is team
-    assert cli._on_a_team("ccea", Meet(), MLP()) == MLP()  # it has one per population
-    assert cli._on_a_team("neuroevolution", Remember(), MLP()) == MLP()
+    network = lambda *given: train._network(Line("train", []), *given)  # noqa: E731
+    expected = Team(trunk=(), head=MLP(), sharing="nothing")
+    assert network("mlp", "neuroevolution", Meet()) == expected
+    assert network("cnf", "merl", Meet()) == load("networks.team:Centralized")()
+    assert network("mlp", "ccea", Meet()) == MLP()  # it has one per population
+    assert network("mlp", "neuroevolution", Remember()) == MLP()
+    assert network(None, "merl", Meet()) is None
 
 
 def test_a_team_of_ones_own_is_given_its_time_limit(credo, tmp_path, monkeypatch):
     pytest.importorskip("pettingzoo")
-    monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parent / "environments"))
+    monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parents[1] / "environments"))
     path = tmp_path / "run"
     flags = (
         "--population-size 5 --elite-fraction 0.2 --episodes 1 --workers 1 --network.trunk 4 "
@@ -860,9 +957,9 @@ def test_list_shows_what_teams_need(credo):
         ("train ppo rover", "Rover has 6 agents: PPO cannot learn that. Evolve without a learner"),
         ("train cerl rover", "MLP acts for one agent and Rover has 6"),
         ("train neuroevolution Pendulum-v1 --network dmmu", "DMMU acts for a team and Pendulum-v1"),
-        ("train matd3 Pendulum-v1", "Team acts for a team and Pendulum-v1 has one agent"),
+        ("train matd3 Pendulum-v1", "trains teams and Pendulum-v1 has one agent"),
         ("train matd3 Pendulum-v1 --network mlp", "one agent"),
-        ("train merl Pendulum-v1", "Team acts for a team and Pendulum-v1 has one agent"),
+        ("train merl Pendulum-v1", "trains teams and Pendulum-v1 has one agent"),
         ("train merl rover --coupling 0", "coupling"),
         ("train merl rover --fitness fun", "no reward signal 'fun': this task has global, local"),
         ("train mrl rover", "did you mean 'merl'?"),
@@ -884,7 +981,8 @@ def test_ctrl_c_ends_a_command_without_taking_python_apart():
         "import atexit, sys\nfrom credo import cli\n"
         "atexit.register(lambda: print('taken apart'))\n"
         "def stop(argv):\n    print('begun')\n    raise KeyboardInterrupt\n"
-        "cli._list = stop\nsys.argv = ['credo', 'list']\ncli.main()\n"
+        "import credo.cli.list\ncredo.cli.list.run = stop\n"
+        "sys.argv = ['credo', 'list']\ncli.main()\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "begun\n", "credo: stopped\n")
