@@ -4,6 +4,7 @@ names from here, so that nothing is imported before it is used."""
 from .algorithms.bptt import BPTT as BPTT
 from .algorithms.ccea import CCEA as CCEA
 from .algorithms.erl import ERL as ERL
+from .algorithms.fitness import Parsimony as Parsimony
 from .algorithms.merl import MERL as MERL
 from .algorithms.neuroevolution import Neuroevolution as Neuroevolution
 from .algorithms.off_policy import OffPolicy as OffPolicy
@@ -11,6 +12,7 @@ from .algorithms.ppo import PPO as PPO
 from .environments.base import AbstractEnvironment as AbstractEnvironment
 from .environments.base import AbstractSequenceTask as AbstractSequenceTask
 from .environments.checks import check_environment as check_environment
+from .environments.curriculum import Curriculum as Curriculum
 from .environments.extended_tmaze import ExtendedTMaze as ExtendedTMaze
 from .environments.gymnasium import Gymnasium as Gymnasium
 from .environments.host import AbstractHostEnvironment as AbstractHostEnvironment
@@ -28,14 +30,12 @@ from .evolution.agents import Homogenize as Homogenize
 from .evolution.crossover import AbstractCrossover as AbstractCrossover
 from .evolution.crossover import MaskedCrossover as MaskedCrossover
 from .evolution.crossover import OnePointCrossover as OnePointCrossover
-from .evolution.curriculum import Curriculum as Curriculum
 from .evolution.extinction import Extinction as Extinction
 from .evolution.islands import Islands as Islands
 from .evolution.mutation import AbstractMutation as AbstractMutation
 from .evolution.mutation import GaussianMutation as GaussianMutation
 from .evolution.mutation import MatrixMutation as MatrixMutation
 from .evolution.mutation import Mutations as Mutations
-from .evolution.parsimony import Parsimony as Parsimony
 from .evolution.selection import AbstractSelection as AbstractSelection
 from .evolution.selection import Tournament as Tournament
 from .evolution.selection import Truncation as Truncation

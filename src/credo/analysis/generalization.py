@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..compilation import jit
-from ..rollout import play_sequences
+from ..environments.wrappers import Given
+from ..rollout import evaluate
 from . import counting
 
 
@@ -27,8 +28,8 @@ def success_with_gap(
         return task.lay_out(signals, jnp.full(task.depth, gap))
 
     sequences = jax.vmap(sequence)(jax.random.split(key, episodes))
-    sequences = jax.tree.map(lambda x: x[None], sequences)
-    return jnp.mean(play_sequences(task, policies, sequences).returns["success"], axis=1)
+    played = evaluate(Given(task, sequences), policies, episodes, key=key)
+    return jnp.mean(played.returns["success"], axis=1)
 
 
 def first_mistakes(

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 
 from ..analysis.generalization import first_mistakes
-from ..evolution.curriculum import Curriculum
+from ..environments.curriculum import Curriculum
 from ..report.rows import Row, rows
 from .base import Cell, Experiment, Trained
 from .dissertation import told

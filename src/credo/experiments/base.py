@@ -55,12 +55,14 @@ from typing import Any
 from jaxtyping import PyTree
 
 from .. import tree
-from ..report.page import write as write_page
+from ..executors import local
+from ..report.pages import write as write_page
 from ..report.rows import Label, Labels, Results, Row, Series, concat, read, write
 from ..report.sections import Page, Section
-from ..runs import config, executor, log
-from ..runs.loop import Run
+from ..runs import config, log
+from ..runs.options import RunOptions
 from ..runs.record import RunError
+from ..runs.store import Run
 from . import catalogue
 
 BUDGETS = ("smoke", "quick", "full")  # seconds, minutes, hours
@@ -243,11 +245,11 @@ def trained(
     """The cells with their runs, in folders of `work`; what is missing of them is trained."""
     paths = [[work / cell.folder / str(seed) for seed in cell.seeds] for cell in cells]
     wanted = [
-        executor.Job(path, cell.algorithm, cell.generations, seed, cell.frames, None, cell.stop_at)
+        local.Job(path, cell.algorithm, seed, RunOptions(**cell.budget, tensorboard=False))
         for cell, folders in zip(cells, paths, strict=True)
         for seed, path in zip(cell.seeds, folders, strict=True)
     ]
-    executor.run(wanted, jobs, title=title)
+    local.run(wanted, jobs, title=title)
     return [
         Trained(cell, [Run(path) for path in folders], budget)
         for cell, folders in zip(cells, paths, strict=True)

@@ -17,7 +17,7 @@ from ..networks.base import AbstractNetwork
 from ..networks.mlp import MLP
 from ..networks.mmu import MMU
 from ..networks.recurrent import Recurrent
-from ..report import maze_page
+from ..report import mazes
 from ..report import sections as page
 from ..report.rows import Results, Row, Series, rows, series
 from ..rollout import evaluate
@@ -152,7 +152,7 @@ def shares(trained: Trained) -> Iterator[Row | Series]:
     if jax.tree.leaves(champion.start(key=key)):
         yield Row(trained.labels, None, "best run", best)
         trace = maze_trace.trace_maze(trained.env, champion, key=key)
-        yield from episode(trained, trained.seeds[best], maze_page.plain(trained.env, trace))
+        yield from episode(trained, trained.seeds[best], trace.plain(trained.env))
 
 
 def episode(trained: Trained, seed: int, played: dict[str, Any]) -> Iterator[Series]:
@@ -181,7 +181,7 @@ def pictures(results: Results, values: Sequence[Value]) -> Iterator[page.Section
         played |= {"depth": labels["depth"], "memory": [found["memory"]] if found["memory"] else ()}
         name, seeds = named(present(labels)), len(here.by_seed(METRIC))
         title = f"An episode of {name}: seed {curves['goal'][0].seed}, the best of {seeds}"
-        yield from maze_page.pictures(title, played)
+        yield from mazes.pictures(title, played)
 
 
 def without_memory(results: Results, values: Sequence[Value]) -> page.Cell:

@@ -2,11 +2,13 @@
 
 from collections.abc import Iterable, Sequence
 
+import jax
 import numpy as np
 
-from ..report import replay_page, trajectories
+from ..report import trajectories
 from ..report.rows import Results, Row, Series, rows, series
 from ..report.sections import Drawing
+from ..rollout import record
 from .base import Cell, Experiment, Trained, Value, named
 from .fig_7_4 import BUDGETS, MEASURES, Plan, cell, notes, rovers, table
 from .views import Table, plain, present
@@ -35,15 +37,16 @@ def cells(budget: str) -> list[Cell]:
 
 def paths(cell: Trained) -> list[Row | Series]:
     """Where rovers of each run drove in one world (m), and which POIs they observed."""
-    worlds = [replay_page.play(cell.env, run.champion, [SEED])[0] for run in cell.runs]
-    place = np.round([np.asarray(world.position, np.float64) for world in worlds], 2)
-    poi, steps = np.round(np.asarray(worlds[0].poi, np.float64), 2), np.arange(place.shape[1])
+    key = jax.random.key(SEED)
+    worlds = [cell.env.shown(record(cell.env, run.champion, key=key)) for run in cell.runs]
+    place = np.round([np.asarray(world["position"], np.float64) for world in worlds], 2)
+    poi, steps = np.round(np.asarray(worlds[0]["poi"], np.float64), 2), np.arange(place.shape[1])
     seeds, found = cell.seeds, []
     for axis, name in enumerate(("x", "y")):
         along = np.moveaxis(place[..., axis], 1, 2)  # [runs, rovers, steps]
         found += series(name, "step", steps, along, cell.labels, seed=seeds, rover=None)
         found += rows(f"POI {name}", poi[:, axis], cell.labels, poi=None)
-    observed = [np.asarray(world.observed[-1]).astype(int) for world in worlds]
+    observed = [np.asarray(world["observed"][-1]).astype(int) for world in worlds]
     found += rows("observed", observed, cell.labels, seed=seeds, poi=None)
     found += rows("activation distance", float(cell.env.activation_distance), cell.labels)
     return found + rows("size", float(cell.env.size), cell.labels)

@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .. import tree
+from ..algorithms.lineage import MAKERS
 from ..analysis import attribution, planner, statistics
 from ..environments.gymnasium import close_all
 from ..environments.rover import Rover
 from ..environments.wrappers import DelayedHostReward
-from ..evolution.lineage import MAKERS
 from ..networks.exploration import Explorer, GaussianNoise
 from ..networks.mlp import MLP
 from ..report.rows import Row, Series, rows, series
