@@ -49,7 +49,7 @@ def expected(algorithm: Any) -> list[float]:
     """Shares of an actor that is no better or worse than the others: a random rank, and as many
     tournaments as there are offspring."""
     k, e = algorithm.population_size, algorithm.elites
-    entrants = algorithm.selection.size
+    entrants = algorithm.breeder.selection.size
     ranks = np.arange(e, k)  # of those that are no elite, 0 the best
     wins = ((k - ranks) / k) ** entrants - ((k - ranks - 1) / k) ** entrants
     selected = np.sum(1.0 - (1.0 - wins) ** (k - e)) / k
