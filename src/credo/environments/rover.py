@@ -57,7 +57,7 @@ REWARDS = ("global", "local", "mixed", "difference", "dpp")
 LEGEND = (
     Mark("arrow", "c0", "a rover, in its own colour, and its path so far"),
     Mark("ring", "muted", "activation distance of a POI, in as many arcs as rovers it needs"),
-    Mark("ring", "ink", "an arc is dark for each rover inside"),
+    Mark("ring", "ink", "an arc stands out for each rover inside"),
     Mark("rhombus", "ink", "POI that is not observed yet"),
     Mark("diamond", "bad", "observed POI, with the step in which it was"),
     Mark("line", "c0", "sensors, inner ring: other rovers"),
