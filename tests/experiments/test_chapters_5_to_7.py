@@ -179,7 +179,7 @@ def test_every_method_on_rovers_has_the_same_team_discount_rates_and_updates():
     assert {x.signal for x in learners} >= {"local", "mixed", "global"}
 
 
-# ---------------------------------------------------------------------------- measured, and its page
+# --------------------------------------------------------------------------- measured, and its page
 
 
 @pytest.mark.parametrize("name", [*ON_MUJOCO, *TEAMS])
@@ -332,7 +332,7 @@ def test_what_is_lost_without_selection():
     assert table.rows == [["Swimmer-v5", 90.0, 20.0, "~ -80 %", "-78 %"]]
 
 
-# ------------------------------------------------------------------------------------ rovers, made up
+# ---------------------------------------------------------------------------------- rovers, made up
 
 
 def made_up(method, coupling=4, **metrics):
