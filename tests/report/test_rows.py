@@ -46,7 +46,8 @@ def test_a_file_has_a_line_for_each_row_and_gives_it_back(tmp_path):
     assert record["columns"] == ["task", "depth", "seed", "metric", "value"]
     assert record["rows"][2] == [None, 2.5, None, "b", "text"]
     assert record["curves"][0]["seeds"] == {"0": [0.5, None], "1": [1, 2]}
-    assert '["A", null, 1, "a", null]' in (tmp_path / "results.json").read_text().splitlines()[9]
+    lines = (tmp_path / "results.json").read_text().splitlines()
+    assert '["A", null, 1, "a", null],' in lines
 
 
 @pytest.mark.parametrize("text", ["{", "{}", '{"measured": {}}', "[]"])
