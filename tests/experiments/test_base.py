@@ -110,7 +110,7 @@ def test_only_matches_what_a_reader_sees():
     assert len(base.matching(cells, "MERL, COUPLING 4", "fig-7.4")) == 3
     with pytest.raises(RunError, match=r"--only '\(' is no regular expression"):
         base.matching(cells, "(", "fig-7.4")
-    with pytest.raises(RunError, match="no cell of fig-7.4 has 'hopper' in its name: there are m"):
+    with pytest.raises(RunError, match=r"no cell of fig-7.4 has 'hopper' in its name: there are m"):
         base.matching(cells, "hopper", "fig-7.4")
 
 

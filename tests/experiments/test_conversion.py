@@ -14,8 +14,8 @@ from credo.report.rows import read
 
 ROOT = pathlib.Path(base.__file__).parents[3]
 sys.path.insert(0, str(ROOT / "tools"))
-import convert_chapters_5_7 as chapters
-import convert_results as tool
+import convert_chapters_5_7 as chapters  # noqa: E402
+import convert_results as tool  # noqa: E402
 
 RESULTS = sorted((ROOT / "results").glob("*/*/results.json"))
 LINES = {

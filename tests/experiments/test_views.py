@@ -6,9 +6,7 @@ import pytest
 from credo.experiments.base import Value, grid
 from credo.experiments.views import (
     Curves,
-    HeatMap,
     Notes,
-    Pivot,
     Table,
     count,
     each,
@@ -90,14 +88,6 @@ def test_rows_without_content_and_views_without_rows_are_left_out(results):
     assert list(Curves("no such metric", "frames", ["method"])(results, ())) == []
 
 
-def test_a_pivot_has_a_column_for_each_level(results):
-    (table,) = Pivot("P", plain("return"), "task", "method", {"random": known("random")})(
-        results, ()
-    )
-    assert table.columns == ["task", "erl", "ea", "random"]
-    assert table.rows == [["A", 2.5, 12.5, 0.0], ["B", 22.5, 32.5, 1.0]]
-
-
 def test_curves_have_a_panel_and_a_line_for_their_labels(results):
     view = Curves("score", "frames", ["method"], ["task"], levels={"random": known("random")})
     first, second = view(results, ())
@@ -119,12 +109,6 @@ def test_curves_over_a_label_have_a_point_for_each_of_its_numbers():
     (curve,) = figure.curves
     assert list(curve.x) == [2, 5]
     np.testing.assert_allclose(curve.runs, [[30, 10], [np.nan, 20]])
-
-
-def test_a_heat_map_averages_runs(results):
-    (figure,) = HeatMap("score", "method", "frames", ["task"])(results.where(task="B"), ())
-    np.testing.assert_array_equal(figure.values, [[2] * 3, [3] * 3])
-    assert (figure.row_labels, figure.column_labels) == (["erl", "ea"], ["1", "2", "3"])
 
 
 def test_notes_say_what_is_true_of_the_page(results):

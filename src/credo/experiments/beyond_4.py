@@ -155,9 +155,9 @@ def of_question(title: str, where: dict[str, Any]) -> list[Any]:
     ]
 
 
-def if_any(task: str, text: page.Text) -> Any:
-    """A text that is shown if there is anything of its task."""
-    return lambda results, values: [text] if results.where(task=task).rows else []
+def if_any(task: str, view: Any) -> Any:
+    """A view that is shown if there is anything of its task."""
+    return lambda results, values: view(results, values) if results.where(task=task).rows else []
 
 
 FLEETS = {"task": "server fleet"}

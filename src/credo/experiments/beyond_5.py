@@ -1,54 +1,47 @@
 """Beyond chapter 5: who made the champions of ERL. Also how attributions are shown."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
 
 from ..analysis.attribution import FATES
 from ..report.rows import Results
 from ..report.sections import Section
 from . import measures, table_5_2
 from .base import Experiment, Value
-from .fig_5_3 import BUDGETS, MEASURES, REFERENCES, VARIANTS, curves, notes, table
+from .dissertation import notes, told
+from .fig_5_3 import BUDGETS, MEASURES, TABLE, VARIANTS, curves
 from .views import Curves, Table, each, mean, of_metric
 
 CELL = (*VARIANTS, "task")
-SHARES = (0.0, 1.0)
 
 
 def makers(results: Results, values: Sequence[Value]) -> Iterable[Section]:
     """A line for each operator that was the last to change a champion."""
     found = of_metric(results, "last changed by").curves
     made = {curve.labels["operator"] for curve in found if any(curve.values)}
-    return Curves(
-        "last changed by",
-        "frames",
-        ["operator"],
-        CELL,
-        title="{panel}: who was the last to change the champion",
-        y_label="share of champions, mean of a tenth of the run",
-        where={"operator": tuple(made)},
-        y_range=SHARES,
-    )(results, values)
+    return replace(MADE, where={"operator": tuple(made)})(results, values)
 
 
-ancestry = Curves(
-    "ancestry",
-    "frames",
-    ["ancestor"],
-    CELL,
-    title="{panel}: where the champion's weights come from",
-    y_label="expected share",
-    y_range=SHARES,
+def shares(metric: str, line: str, title: str, y_label: str) -> Curves:
+    """Shares over frames, a figure for each cell."""
+    told: dict[str, Any] = {"title": f"{{panel}}: {title}", "y_label": y_label}
+    return Curves(metric, "frames", [line], CELL, y_range=(0.0, 1.0), **told)
+
+
+MADE = shares(
+    "last changed by",
+    "operator",
+    "who was the last to change the champion",
+    "share of champions, mean of a tenth of the run",
 )
-allocation = Curves(
-    "allocation so far",
-    "frames",
-    ["learner"],
-    CELL,
-    title="{panel}: workers of each learner so far",
-    y_label="share of all workers",
-    y_range=SHARES,
+ANCESTRY = shares(
+    "ancestry", "ancestor", "where the champion's weights come from", "expected share"
 )
-fates = Table(
+ALLOCATION = shares(
+    "allocation so far", "learner", "workers of each learner so far", "share of all workers"
+)
+FATE = Table(
     "Learners: their workers, and the fate of their actors in the population",
     ["task", *VARIANTS, "learner"],
     {
@@ -59,25 +52,10 @@ fates = Table(
     caption="Injected: actors that were judged; the last ones may not have been. Selected: a "
     "parent, but no elite.",
 )
-
 EXPERIMENT = Experiment(
-    published="Not in the dissertation, which counts what became of the learner's actors (Table "
-    "5.2) and not what became of them later. Here every champion's line is followed back.",
+    **told("beyond-5", "mujoco"),
     budgets=BUDGETS,
     cells=table_5_2.cells,
     measures=(*MEASURES, measures.lineage),
-    values=REFERENCES,
-    views=(
-        makers,
-        ancestry,
-        fates,
-        curves(),
-        table(),
-        notes(
-            "The last to change a champion is mutation nearly always, elites and fresh actors of "
-            "the learner aside: most offspring are mutated. Shares of weights say more: a child "
-            "has them from its parent, a crossed one from each of two what it took of them, and "
-            "mutation does not change whose line it is.",
-        ),
-    ),
+    views=(makers, ANCESTRY, FATE, curves(), TABLE, notes("mujoco", "beyond-5")),
 )

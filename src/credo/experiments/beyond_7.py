@@ -8,7 +8,8 @@ from ..networks.mmu import MMU
 from ..networks.recurrent import Recurrent
 from ..networks.team import Team
 from .base import Cell, Experiment
-from .fig_7_4 import BUDGETS, MEASURES, Plan, curves, notes, rovers, table
+from .dissertation import notes, told
+from .fig_7_4 import MEASURES, Plan, curves, rovers, table
 from .small import shrunk
 
 PLANS = {
@@ -47,18 +48,9 @@ def cells(budget: str) -> list[Cell]:
 
 
 EXPERIMENT = Experiment(
-    published="Not in the dissertation, which names rewards at more than two levels as future "
-    "work. D is the difference reward G - G without the agent; D++ adds copies of it "
-    "(Rahmattalabi et al. 2016).",
-    budgets=BUDGETS,
+    **told("beyond-7"),
+    budgets=tuple(PLANS),
     cells=cells,
     measures=MEASURES,
-    views=(
-        table("coupling", "method"),
-        curves("coupling"),
-        notes(
-            "D and D++ are computed by the simulator from what happened, with the paths of the "
-            "others as they were. Memory is evolved only."
-        ),
-    ),
+    views=(table("coupling", "method"), curves("coupling"), notes("rovers", "beyond-7")),
 )

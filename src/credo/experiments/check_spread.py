@@ -13,10 +13,11 @@ from ..networks.exploration import GaussianNoise
 from ..networks.mlp import Critic
 from ..networks.team import JointCritic, Team
 from . import measures
-from .base import Cell, Experiment, Value
+from .base import Cell, Experiment
+from .dissertation import notes, told
 from .fig_7_4 import Plan
 from .small import shrunk
-from .views import Curves, Notes, Table, known, mean, plain, published
+from .views import Curves, Table, known, mean, plain, published
 
 PLANS = {
     "smoke": Plan(1_000, 2),
@@ -67,10 +68,26 @@ def random(env: SimpleSpread) -> dict[str, float]:
     return {"random": round(float(np.mean(played)), 2)}
 
 
+COLUMNS = {
+    "baseline: random": known("random"),
+    "published": published("return"),
+    "to be exceeded": published("to be exceeded"),
+    "final actor": mean("return"),
+    "median": plain("return", of=np.median),
+    "frames": plain("frames"),
+}
+CAPTION = f"Final actor: {EPISODES} fresh episodes without noise."
+LEVELS = {"random": known("random"), "a script": published("a script")}
+CURVES = Curves(
+    "test score",
+    "frames",
+    ["method"],
+    title="simple_spread",
+    y_label="return of the actor, mean per agent",
+    levels=LEVELS,
+)
 EXPERIMENT = Experiment(
-    published="Not in the dissertation. Others on simple_spread_v3 (continuous actions, "
-    "local_ratio 0.5, mean per agent): random -26.7, MADDPG -9.6 ± 0.3 after 10M steps, MATD3 "
-    "-7.4 to -8.4 with one seed stuck at -23.9, a script -7.5.",
+    **told("check-spread"),
     cells=cells,
     measures=(
         measures.final(episodes=EPISODES, digits=3, each=False),
@@ -78,41 +95,9 @@ EXPERIMENT = Experiment(
         measures.effort,
         measures.of_task(random),
     ),
-    values=[
-        Value(-9.6, "return", "other code, 10M steps", {"method": "maddpg"}, "± 0.3"),
-        Value("-7.4 … -8.4, one -23.9", "return", "other code", {"method": "matd3"}),
-        Value(-12.0, "to be exceeded", "our choice", {"method": "maddpg"}),
-        Value(-10.0, "to be exceeded", "our choice", {"method": "matd3"}),
-        Value(-7.5, "a script", "other code"),
-    ],
     views=(
-        Curves(
-            "test score",
-            "frames",
-            ["method"],
-            title="simple_spread",
-            y_label="return of the actor, mean per agent",
-            levels={"random": known("random"), "a script": published("a script")},
-        ),
-        Table(
-            "Return per episode, mean over agents",
-            ["method"],
-            {
-                "baseline: random": known("random"),
-                "published": published("return"),
-                "to be exceeded": published("to be exceeded"),
-                "final actor": mean("return"),
-                "median": plain("return", of=np.median),
-                "frames": plain("frames"),
-            },
-            caption=f"Final actor: {EPISODES} fresh episodes without noise.",
-        ),
-        Notes(
-            [
-                "The task is SimpleSpread, a JAX version that matches mpe2's simple_spread_v3 step "
-                "for step. A frame is one joint step; an update moves all three agents. Published "
-                "numbers are of other code and more frames."
-            ]
-        ),
+        CURVES,
+        Table("Return per episode, mean over agents", ["method"], COLUMNS, caption=CAPTION),
+        notes("check-spread"),
     ),
 )

@@ -6,8 +6,8 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
-from ..report.sections import Text
 from .base import Value
+from .views import Notes, where
 
 
 @cache
@@ -16,14 +16,17 @@ def _every() -> dict[str, Any]:
     return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
-def told(name: str) -> dict[str, Any]:
-    """The lead of an experiment's page and its published values, as `Experiment` takes them."""
-    found = _every()[name]
-    common = {key: found[key] for key in ("metric", "source") if key in found}
-    values = [Value(**{**common, **value}) for value in found.get("values", [])]
-    return {"published": found["published"], "values": values}
+def told(name: str, *shared: str) -> dict[str, Any]:
+    """The lead of an experiment's page and its published values, as `Experiment` takes them, with
+    the values that it shares."""
+    values = []
+    for found in [_every()[x] for x in (name, *shared)]:
+        common = {key: found[key] for key in ("metric", "source") if key in found}
+        values += [Value(**{**common, **value}) for value in found.get("values", [])]
+    return {"published": _every()[name]["published"], "values": values}
 
 
-def notes(*names: str) -> Text:
+def notes(*names: str) -> Notes:
     """How to read a page: the notes of these names, one after the other."""
-    return Text("How to read it", [text for name in names for text in _every()[name]["notes"]])
+    every = [note for name in names for note in _every()[name].get("notes", ())]
+    return Notes([x if isinstance(x, str) else where(x["text"], **x["labels"]) for x in every])

@@ -1,6 +1,7 @@
 """Figure 5.4: ERL without selection."""
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -9,21 +10,17 @@ from ..evolution.selection import Uniform
 from ..report.rows import Results
 from ..report.sections import Table
 from .base import Cell, Experiment, Value
-from .fig_5_3 import BUDGETS, MEASURES, REFERENCES, cell, curves, notes, table, tasks
+from .dissertation import notes, told
+from .fig_5_3 import MUJOCO, TABLE, cell, curves, tasks
 
 WITH, WITHOUT = "erl", "erl without selection"
 
 
 def cells(budget: str) -> list[Cell]:
     """ERL with and without selection."""
-    return [
-        made
-        for task in tasks(budget, ("HalfCheetah-v5", "Swimmer-v5"))
-        for made in (
-            cell(WITH, ERL.erl, task, budget),
-            cell(WITHOUT, ERL.erl, task, budget, selection=Uniform()),
-        )
-    ]
+    builds = {WITH: ERL.erl, WITHOUT: partial(ERL.erl, selection=Uniform())}
+    chosen = tasks(budget, ("HalfCheetah-v5", "Swimmer-v5"))
+    return [cell(x, builds[x], task, budget) for task in chosen for x in builds]
 
 
 def ablation(results: Results, values: Sequence[Value]) -> Iterable[Table]:
@@ -48,19 +45,8 @@ def ablation(results: Results, values: Sequence[Value]) -> Iterable[Table]:
 
 
 EXPERIMENT = Experiment(
-    published="Figure 5.4 of the dissertation: without the selection operator the score, as a "
-    "share of the best of full ERL, falls by about 80 % on HalfCheetah and Swimmer.",
-    budgets=BUDGETS,
+    **told("fig-5.4", "mujoco"),
+    **MUJOCO,
     cells=cells,
-    measures=MEASURES,
-    values=REFERENCES,
-    views=(
-        curves(),
-        ablation,
-        table(),
-        notes(
-            "Without selection parents and elites are drawn uniformly. The champion that is tested "
-            "is still the fittest of its generation."
-        ),
-    ),
+    views=(curves(), ablation, TABLE, notes("mujoco", "fig-5.4")),
 )

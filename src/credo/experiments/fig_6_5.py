@@ -1,29 +1,16 @@
 """Figure 6.5: CERL, its learners alone, and evolution on four tasks. Also what all experiments on
 CERL share: portfolios, their parts, measurements and views."""
 
-import dataclasses
+from dataclasses import replace
 from typing import Any
 
 from ..algorithms.erl import ERL
 from ..environments.gymnasium import Gymnasium
 from ..learners.td3 import TD3
-from ..report.rows import Row, Series
-from . import beyond_5, measures
-from .base import Cell, Experiment, Trained
-from .fig_5_3 import (
-    BUDGETS,
-    REFERENCES,
-    STAND_IN,
-    SWIMMER,
-    VARIANTS,
-    cell,
-    curves,
-    notes,
-    table,
-    td3_gamma,
-)
-from .fig_5_3 import MEASURES as SCORES
-from .fig_5_3 import tasks as all_tasks
+from . import beyond_5, fig_5_3, measures
+from .base import Cell, Experiment
+from .dissertation import notes, told
+from .fig_5_3 import BUDGETS, STAND_IN, TABLE, VARIANTS, cell, curves, long_view, td3
 from .views import Table, mean, published
 
 PORTFOLIO = (0.9, 0.99, 0.997, 0.9995)  # γ of learners L1 to L4
@@ -40,53 +27,41 @@ def portfolio(gammas: tuple[float, ...]) -> tuple[TD3, ...]:
     """TD3 as in `ERL.cerl`, at these discounts."""
     like = ERL.cerl(Gymnasium(STAND_IN)).learners[0]
     assert isinstance(like, TD3)
-    return tuple(dataclasses.replace(like, gamma=gamma) for gamma in gammas)
+    return tuple(replace(like, gamma=gamma) for gamma in gammas)
 
 
 def parts(task: str, budget: str, gammas: tuple[float, ...] = PORTFOLIO) -> list[Cell]:
     """What a portfolio is made of: evolution, and each of its learners, alone."""
-    alone = [td3_gamma(task, budget, gamma) for gamma in gammas]
+    alone = [td3(task, budget, gamma) for gamma in gammas]
     return [cerl(task, budget, "ea of cerl", learners=(), manager=None), *alone]
 
 
 def tasks(budget: str, of: tuple[str, ...] = TASKS) -> tuple[str, ...]:
     """Fewer at quick: a portfolio of four takes four times as long."""
-    return all_tasks(budget, of)[:1] if budget == "quick" else all_tasks(budget, of)
+    return fig_5_3.tasks(budget, of)[: 1 if budget == "quick" else None]
 
 
 def cells(budget: str) -> list[Cell]:
-    """CERL and its parts; on Swimmer also TD3 with a longer view."""
+    """CERL and its parts."""
     chosen = tasks(budget)
     found = [x for task in chosen for x in (cerl(task, budget), *parts(task, budget))]
-    long_view = "Swimmer-v5" in chosen
-    return [*found, td3_gamma("Swimmer-v5", budget, 0.9999)] if long_view else found
+    return found + long_view(chosen, budget)
 
 
-# ----------------------------------------------------------------------------- measures and views
-
-
-def lineage(cell: Trained) -> list[Row | Series]:
-    """Attribution, of cells that have a portfolio."""
-    learners = getattr(cell.cell.algorithm, "learners", ())
-    return measures.lineage(cell) if len(learners) > 1 else []
-
-
-MEASURES = (*SCORES, lineage)
-ATTRIBUTION = (beyond_5.makers, beyond_5.ancestry, beyond_5.allocation, beyond_5.fates)
+ATTRIBUTION = (beyond_5.makers, beyond_5.ANCESTRY, beyond_5.ALLOCATION, beyond_5.FATE)
 ALLOCATION = Table(
     "Cumulative allocation, in percent of all rollout workers",
     ["task", *VARIANTS, "learner"],
     {"published": published("allocation, %"), "measured": mean("allocation", 100, digits=1)},
     caption="An even share of four learners is 25 %.",
 )
-
+PORTFOLIOS: dict[str, Any] = {
+    "budgets": BUDGETS,
+    "measures": (*fig_5_3.MEASURES, measures.of_portfolio),
+}
 EXPERIMENT = Experiment(
-    published="Figure 6.5 of the dissertation (curves without numbers): TD3 at γ 0.99 needs fewer "
-    "frames than CERL on Hopper, HalfCheetah and Walker2d, CERL fewer than the other TD3s; of "
-    "Swimmer only CERL and evolution are said to be capable.",
-    budgets=BUDGETS,
+    **told("fig-6.5", "mujoco"),
+    **PORTFOLIOS,
     cells=cells,
-    measures=MEASURES,
-    values=REFERENCES,
-    views=(curves(), table(), *ATTRIBUTION, notes(SWIMMER)),
+    views=(curves(), TABLE, *ATTRIBUTION, notes("mujoco", "swimmer")),
 )

@@ -13,11 +13,11 @@ from ..learners.td3 import maddpg, matd3
 from ..networks.team import Team
 from ..report.rows import Labels
 from . import measures
-from .base import Cell, Experiment, Value
+from .base import Cell, Experiment
+from .dissertation import notes, told
 from .small import shrunk
-from .views import Curves, Notes, Table, known, mean, plain, published
+from .views import Curves, Table, known, mean, plain, published
 
-BUDGETS = ("smoke", "quick", "full", "published")
 METHODS: dict[str, tuple[str, str]] = {  # what learns, and from which reward
     "merl": ("merl", "local"),
     "ea": ("ea", "global"),
@@ -48,9 +48,6 @@ DYNAMICS = {
     "author's dynamics": CODED,
     "author's dynamics and sensors": CODED | {"observation": "as-coded"},
 }
-
-
-# ------------------------------------------------------------------------------------------ cells
 
 
 def build(method: str, env: Rover, updates_per_frame: float) -> Any:
@@ -111,21 +108,13 @@ def cells(budget: str) -> list[Cell]:
         for n in COUPLINGS.get(budget, range(1, 8))
         for method in COMPARED
     ]
-    coded = [
-        cell(
-            method,
-            rovers(method, coupling=4, **fields),
-            {"coupling": 4, "dynamics": dynamics},
-            budget,
-            PLANS[budget],
-        )
-        for dynamics, fields in DYNAMICS.items()
-        for method in ("merl", "ea", "td3 local")
-    ]
-    return found + coded
+    for dynamics, fields in DYNAMICS.items():
+        labels = {"coupling": 4, "dynamics": dynamics}
+        for method in ("merl", "ea", "td3 local"):
+            env = rovers(method, coupling=4, **fields)
+            found.append(cell(method, env, labels, budget, PLANS[budget]))
+    return found
 
-
-# ----------------------------------------------------------------------------- measures and views
 
 SHARE = "share of POIs"
 MEASURES = (
@@ -134,18 +123,24 @@ MEASURES = (
     measures.effort,
     measures.of_task(measures.rover_baselines),
 )
+LEVELS = {"random": known("random"), "greedy script": known("greedy")}
+COLUMNS = {
+    "baseline: random": known("random"),
+    "baseline: greedy script": known("greedy"),
+    "published": published(SHARE),
+    "final champion": mean(SHARE),
+    "median": plain(SHARE, of=np.median),
+    "planner reached": known("scripted"),
+    "upper bound": known("bound"),
+    "frames": plain("frames"),
+    "updates per frame": plain("updates per frame"),
+}
 
 
 def curves(*panel: str) -> Curves:
     """The champions' tests of every method, a figure for each of these labels."""
-    return Curves(
-        "test score",
-        "frames",
-        ["method"],
-        panel,
-        y_label="share of POIs, champion",
-        levels={"random": known("random"), "greedy script": known("greedy")},
-    )
+    label = "share of POIs, champion"
+    return Curves("test score", "frames", ["method"], panel, y_label=label, levels=LEVELS)
 
 
 def table(*rows: str) -> Table:
@@ -153,61 +148,21 @@ def table(*rows: str) -> Table:
     return Table(
         "Share of POIs that the final champion observes",
         rows,
-        {
-            "baseline: random": known("random"),
-            "baseline: straight lines": known("straight"),
-            "baseline: greedy script": known("greedy"),
-            "published": published(SHARE),
-            "final champion": mean(SHARE),
-            "median": plain(SHARE, of=np.median),
-            "planner reached": known("scripted"),
-            "upper bound": known("bound"),
-            "frames": plain("frames"),
-            "updates per frame": plain("updates per frame"),
-        },
+        COLUMNS,
         caption="Final champion: 100 fresh worlds without noise, the same for all. Baselines and "
         "planner: 50 worlds. The greedy script drives to the closest POI that its sensors show; "
         "the planner knows every position.",
     )
 
 
-def notes(*paragraphs: str) -> Notes:
-    """What to know before comparing."""
-    shared = (
-        "A frame is one joint step of a team; those of the whole population and of learners are "
-        "counted, those of tests are not. All methods have the same multi-headed team, discount "
-        "(0.97), rates, batch, exploration noise and updates per frame; one update moves all "
-        "heads. Critics of MERL and TD3 see one agent (2 × 100 units), those of MATD3 and MADDPG "
-        "the whole team (2 × 128 units for each agent). `mixed` is local + "
-        f"{Rover().mixed_weight:g} · global, a weight that was not searched."
-    )
-    return Notes([shared, *paragraphs])
-
-
-LOGS = "the author's logs"
 EXPERIMENT = Experiment(
-    published="Figure 7.4 of the dissertation (curves without numbers): MERL is best at every "
-    "coupling and still learns beyond 6, the baselines degrade beyond 2. The author's logs: at "
-    "coupling 4 MERL 0.46 and EA about 0, at coupling 5 MERL 0.43.",
-    budgets=BUDGETS,
+    **told("fig-7.4"),
+    budgets=tuple(PLANS),
     cells=cells,
     measures=MEASURES,
-    values=(
-        Value(0.46, SHARE, LOGS, {"method": "merl", "coupling": 4}),
-        Value(0.43, SHARE, LOGS, {"method": "merl", "coupling": 5}),
-        Value(0.0, SHARE, LOGS, {"method": "ea", "coupling": 4}),
-    ),
     views=(
         table("coupling", "dynamics", "method"),
         curves("coupling", "dynamics"),
-        notes(
-            "Published: the author's logs, of his dynamics, in which every rover drives at half "
-            "the speed whatever it says, with γ 0.5 for MERL and 0.97 for the baselines. His "
-            "sensors show 1/d², up to 10^6: our critics of rectified units diverge on them, his "
-            "had tanh. The dissertation's budget is 2M frames, the budget `published` here. The "
-            "local reward is progress towards the closest POI that is left; with the "
-            "dissertation's, the distance to the closest POI, see docs/merl.md. Its figures have "
-            "means and 95 % intervals of five runs.",
-        ),
+        notes("rovers", "fig-7.4"),
     ),
 )

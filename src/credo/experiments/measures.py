@@ -154,6 +154,12 @@ def lineage(cell: Trained) -> list[Row | Series]:
     return made
 
 
+def of_portfolio(cell: Trained) -> list[Row | Series]:
+    """The same, of cells with more than one learner."""
+    learners = getattr(cell.cell.algorithm, "learners", ())
+    return lineage(cell) if len(learners) > 1 else []
+
+
 # ------------------------------------------------------------------------------------- baselines
 
 

@@ -12,7 +12,8 @@ from ..report.rows import Results, Row, rows
 from ..runs import log
 from ..runs.loop import Run
 from .base import Cell, Experiment, Trained, Value
-from .fig_5_3 import Plan, cell, notes, tasks
+from .dissertation import notes, told
+from .fig_5_3 import Plan, cell, tasks
 from .views import Table, mean, per_seed
 
 PLANS = {"smoke": Plan(600, 2), "quick": Plan(60_000, 2), "full": Plan(200_000, 3)}
@@ -32,16 +33,12 @@ def cells(budget: str) -> list[Cell]:
     ]
 
 
-def times(cell: Trained) -> list[Row]:
+def times(cell: Trained) -> Iterable[Row]:
     """What the clock says of each run."""
     found = [rates(run) for run in cell.runs]
-    return [
-        row
-        for name in found[0]
-        for row in rows(
-            name, attribution.plain([x[name] for x in found], 6), cell.labels, seed=cell.seeds
-        )
-    ]
+    for name in found[0]:
+        values = attribution.plain([x[name] for x in found], 6)
+        yield from rows(name, values, cell.labels, seed=cell.seeds)
 
 
 def rates(run: Run) -> dict[str, float]:
@@ -77,20 +74,13 @@ def extra(results: Results, values: Sequence[Value]) -> Iterable[page.Table]:
         )
 
 
+CLOCK = Table(
+    "Time",
+    ["task", "method"],
+    {name: mean(name) for name in ("frames", "updates per frame", "seconds", TIME)},
+    caption="Updates and time per frame after the first quarter of each run, so that compiling "
+    "does not count.",
+)
 EXPERIMENT = Experiment(
-    published="Section 5.5 of the dissertation: ERL took about 3 % more time than DDPG, most of it "
-    "mutation.",
-    cells=cells,
-    measures=(times,),
-    views=(
-        Table(
-            "Time",
-            ["task", "method"],
-            {name: mean(name) for name in ("frames", "updates per frame", "seconds", TIME)},
-            caption="Updates and time per frame after the first quarter of each run, so that "
-            "compiling does not count.",
-        ),
-        extra,
-        notes(),
-    ),
+    **told("note-5.5"), cells=cells, measures=(times,), views=(CLOCK, extra, notes("mujoco"))
 )

@@ -7,24 +7,12 @@ import numpy as np
 from ..algorithms.erl import ERL
 from ..analysis import attribution
 from ..report.rows import Row, rows
-from .base import Cell, Experiment, Trained, Value
-from .fig_5_3 import BUDGETS, MEASURES, REFERENCES, cell, curves, notes, table, tasks
+from .base import Cell, Experiment, Trained
+from .dissertation import notes, told
+from .fig_5_3 import BUDGETS, MEASURES, TABLE, cell, curves, tasks
 from .views import Table, each, known, mean, published
 
 FATES = attribution.FATES
-PUBLISHED = {
-    "HalfCheetah": ("83.8 ± 9.3", "14.3 ± 9.1", "2.3 ± 2.5"),
-    "Swimmer": ("4.0 ± 2.8", "20.3 ± 18.1", "76.0 ± 20.4"),
-    "Reacher": ("68.3 ± 9.9", "19.7 ± 6.9", "9.0 ± 6.9"),
-    "Ant": ("66.7 ± 1.7", "15.0 ± 1.4", "18.0 ± 0.8"),
-    "Hopper": ("28.7 ± 8.5", "33.7 ± 4.1", "37.7 ± 4.5"),
-    "Walker2d": ("38.5 ± 1.5", "39.0 ± 1.9", "22.5 ± 0.5"),
-}
-VALUES = [
-    Value(text, "fate, %", "Table 5.2", {"task": f"{task}-v5", "fate": fate})
-    for task, texts in PUBLISHED.items()
-    for fate, text in zip(FATES, texts, strict=True)
-]
 
 
 def cells(budget: str) -> list[Cell]:
@@ -56,30 +44,23 @@ def expected(algorithm: Any) -> list[float]:
     return [round(float(x), 4) for x in (e / k, selected, 1.0 - e / k - selected)]
 
 
+TABLE_5_2 = Table(
+    "What became of injected actors, in percent",
+    ["task", "fate"],
+    {
+        "by chance": known("by chance", 100),
+        "published": published("fate, %"),
+        "measured": mean("fate", 100, digits=1),
+    },
+    where={"fate": FATES},
+    caption="By chance: what an actor of random rank would meet, computed. Selected: the parent of "
+    "an offspring, but no elite.",
+)
+JUDGED = Table("Actors that were judged", ["task"], {"each run": each("injected")})
 EXPERIMENT = Experiment(
-    published="Table 5.2 of the dissertation: of the learner's actors that were copied into the "
-    "population, how many became elite, were selected, or were discarded (mean ± standard "
-    "deviation over runs). HalfCheetah and Swimmer are the extremes.",
+    **told("table-5.2", "mujoco"),
     budgets=BUDGETS,
     cells=cells,
     measures=(fates, *MEASURES),
-    values=[*REFERENCES, *VALUES],
-    views=(
-        Table(
-            "What became of injected actors, in percent",
-            ["task", "fate"],
-            {
-                "by chance": known("by chance", 100),
-                "published": published("fate, %"),
-                "measured": mean("fate", 100, digits=1),
-            },
-            where={"fate": FATES},
-            caption="By chance: what an actor of random rank would meet, computed. Selected: the "
-            "parent of an offspring, but no elite.",
-        ),
-        Table("Actors that were judged", ["task"], {"each run": each("injected")}),
-        curves(),
-        table(),
-        notes(),
-    ),
+    views=(TABLE_5_2, JUDGED, curves(), TABLE, notes("mujoco")),
 )

@@ -233,31 +233,6 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Pivot:
-    """One content `value` over two labels: a row for each level of `rows`, a column for each of
-    `columns`; `beside`: further columns, by their title."""
-
-    title: str
-    value: Of
-    rows: str
-    columns: str
-    beside: Mapping[str, Of] = field(default_factory=dict)
-    where: Mapping[str, Any] = field(default_factory=dict)
-    caption: str = ""
-
-    def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
-        chosen = results.where(**self.where)
-        across = [level for (level,) in combinations(chosen, [self.columns]) if level is not None]
-
-        def of(level: Label) -> Of:
-            return lambda found, given: self.value(found.where(**{self.columns: level}), given)
-
-        columns = {str(label_text(level)): of(level) for level in across}
-        table = Table(self.title, [self.rows], columns | dict(self.beside), caption=self.caption)
-        return table(chosen, values)
-
-
-@dataclass(frozen=True)
 class Curves:
     """Lines over an axis: a figure for each combination of the labels `panel`, a line for each of
     `line`.
@@ -317,41 +292,6 @@ class Curves:
         seeds = dict.fromkeys(seed for place in found for seed in place)
         runs = [[place.get(seed, np.nan) for place in found] for seed in seeds]
         return page.Curve(label, xs, self.scale * np.array(runs, np.float64))
-
-
-@dataclass(frozen=True)
-class HeatMap:
-    """A metric as colours: of series a line for each level of `rows` and a column for each point,
-    of rows two labels. Runs are averaged; `where` picks one. A figure for each of `panel`."""
-
-    metric: str
-    rows: str
-    columns: str
-    panel: Sequence[str] = ()
-    title: str = "{panel}"
-    x_label: str = ""
-    y_label: str = ""
-    where: Mapping[str, Any] = field(default_factory=dict)
-    caption: str = ""
-
-    def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
-        chosen = of_metric(results.where(**self.where), self.metric)
-        for key in combinations(chosen, self.panel):
-            told = dict(zip(self.panel, key, strict=True))
-            here = chosen.where(**told)
-            dims = [self.rows, "seed"] if here.curves else [self.rows, self.columns, "seed"]
-            array = here.array(self.metric, *dims).astype(np.float64)
-            array = array.mean(axis=dims.index("seed"))
-            columns = here.curves[0].at if here.curves else here.levels(self.columns)
-            yield page.HeatMap(
-                titled(self.title, told),
-                array,
-                [str(label_text(x)) for x in here.levels(self.rows)],
-                [str(label_text(x)) for x in columns],
-                self.x_label or self.columns,
-                self.y_label or self.rows,
-                self.caption,
-            )
 
 
 @dataclass(frozen=True)
