@@ -1,0 +1,52 @@
+"""Every experiment by its id, and its title. Imports nothing, so that a list costs no time."""
+
+EXPERIMENTS = {
+    "fig-3.4a": "success by depth, sequence classification",
+    "fig-3.4b": "MMU and recurrent networks by evolution, classification",
+    "fig-3.5a": "generalization to 0..101 distractors",
+    "fig-3.5b": "generalization to depth 101",
+    "table-3.1": "final memory of the 8 permutations of depth 3",
+    "table-3.2": "counting study: -1 x 10^5, then +1 x 10^6",
+    "fig-3.6": "write heat map, depth 3",
+    "fig-3.7": "write heat map, depth 21",
+    "alg-3.3": "the pseudo-algorithm a champion runs",
+    "fig-3.9a": "success by depth, sequence recall",
+    "fig-3.9b": "MMU and recurrent networks by evolution, recall",
+    "fig-3.10": "recall in corridors of 1..101 steps",
+    "fig-3.11": "an MMU by gradient, classification, beside evolution",
+    "fig-3.12": "an MMU by gradient, recall, beside evolution",
+    "fig-3.13": "recall by gradient in corridors of 1..101 steps",
+    "beyond-3": "four networks by evolution and gradient, depth 10^6",
+    "ablation-3.4a": "our settings less one ingredient, 21-deep",
+    "fig-4.2": "T-maze, Converge, beside a static robot",
+    "fig-4.3": "T-maze, Spread, beside a static robot",
+    "fig-4.4": "T-maze, Spread, teams of learning robots",
+    "fig-4.7": "server fleet, DMMU and baselines",
+    "fig-4.8": "writes to the shared memory, by server",
+    "table-4.1": "case study of two servers, six configurations",
+    "beyond-4": "difference rewards, depth 4, LSTM teams, noise, fleets that change",
+    "check-td3": "TD3 alone, against its authors",
+    "check-learners": "DDPG, SAC and TD3 alone, on cheap tasks",
+    "fig-5.2": "standard and hard inverted double pendulum",
+    "fig-5.3": "ERL against its parts on six tasks",
+    "fig-5.4": "ERL without selection",
+    "table-5.2": "fate of the learner's actors",
+    "note-5.5": "time of ERL over that of DDPG",
+    "beyond-5": "who made the champions of ERL",
+    "fig-6.2": "CERL with two learners that fail alone",
+    "fig-6.3": "CERL and its parts on Humanoid",
+    "fig-6.4": "exploration of the resource manager",
+    "fig-6.5": "CERL against its parts on four tasks",
+    "table-6.1": "workers of each learner",
+    "beyond-6": "SAC and a critic of 2024 beside TD3, and three managers",
+    "fig-7.1": "two rovers and a local reward that misleads",
+    "fig-7.4": "rover domain, coupling 1 to 7",
+    "fig-7.5": "paths of teams at coupling 3",
+    "beyond-7": "difference rewards, levels of credit, memory, sharing",
+    "check-spread": "MADDPG and MATD3 on simple_spread",
+}
+
+
+def module(name: str) -> str:
+    """The module of this folder that an id stands for: `fig-3.4a` is `fig_3_4a`."""
+    return name.replace("-", "_").replace(".", "_")
