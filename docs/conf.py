@@ -1,0 +1,29 @@
+"""How Sphinx builds this folder: `make docs`."""
+
+import importlib.metadata
+import pathlib
+import sys
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent / "extensions"))
+
+HOME = ""
+"""The address of the project's repository. While it is empty, no page links there."""
+
+project = "Credo"
+author = "The Credo authors"
+release = importlib.metadata.version("credo")
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_design", "generated_pages", "markdown_docstrings"]
+exclude_patterns = ["extensions"]
+
+myst_enable_extensions = ["deflist", "colon_fence"]
+myst_heading_anchors = 3
+autodoc_typehints = "none"  # shapes and types stand in the text
+autodoc_member_order = "bysource"
+
+html_theme = "furo"
+html_title = "Credo"
+html_copy_source = False
+html_show_copyright = False
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_theme_options = {"source_repository": HOME, "source_branch": "main", "source_directory": "docs/"} if HOME else {}
