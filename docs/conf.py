@@ -3,16 +3,23 @@
 import importlib.metadata
 import pathlib
 import sys
+import tomllib
 
-sys.path.insert(0, str(pathlib.Path(__file__).parent / "extensions"))
-
-HOME = ""
-"""The address of the project's repository. While it is empty, no page links there."""
+HERE = pathlib.Path(__file__).parent
+sys.path.insert(0, str(HERE / "extensions"))
+project_file = tomllib.loads((HERE.parent / "pyproject.toml").read_text("utf-8"))
+home = project_file["tool"]["hatch"]["metadata"]["hooks"]["custom"]["home"]
 
 project = "Credo"
 author = "The Credo authors"
 release = importlib.metadata.version("credo")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_design", "generated_pages", "markdown_docstrings"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx_design",
+    "generated_pages",
+    "markdown_docstrings",
+]
 exclude_patterns = ["extensions"]
 
 myst_enable_extensions = ["deflist", "colon_fence"]
@@ -26,4 +33,9 @@ html_copy_source = False
 html_show_copyright = False
 html_static_path = ["static"]
 html_css_files = ["site.css"]
-html_theme_options = {"source_repository": HOME, "source_branch": "main", "source_directory": "docs/"} if HOME else {}
+if home:
+    html_theme_options = {
+        "source_repository": home,
+        "source_branch": "main",
+        "source_directory": "docs/",
+    }
