@@ -26,6 +26,7 @@ myst_enable_extensions = ["deflist", "colon_fence"]
 myst_heading_anchors = 3
 autodoc_typehints = "none"  # shapes and types stand in the text
 autodoc_member_order = "bysource"
+highlight_language = "text"  # commands and what they print, unless a block says python
 
 html_theme = "furo"
 html_title = "Credo"

@@ -1,6 +1,6 @@
 """The table of `docs/results/index.md`: what is committed of every experiment.
 
-    python docs/extensions/committed.py      # writes it anew, after results were added
+python docs/extensions/committed.py      # writes it anew, after results were added
 """
 
 import json

@@ -67,7 +67,7 @@ def reference(group: str, names: list[tuple[str, object]]) -> str:
     parts = [f"# {title}", lead]
     for name, value in names:
         kind = "class" if isinstance(value, type) else "function"
-        members = "\n   :members:" if kind == "class" else ""
+        members = "\n   :members:\n   :special-members: __call__" if kind == "class" else ""
         parts.append(f"```{{eval-rst}}\n.. auto{kind}:: {name}{members}\n```")
     return "\n\n".join(parts) + "\n"
 
