@@ -1,8 +1,8 @@
 """The README and the addresses of a built package.
 
-A package page has no files beside it, so relative links would lead nowhere. With `home` set under
-`[tool.credo]` in pyproject.toml they lead there; without it links become plain text and pictures are
-left out.
+A package page has no files beside it, so relative links would lead nowhere. With `home` set in
+pyproject.toml (`[tool.hatch.metadata.hooks.custom]`) they lead there; without it links become plain
+text and pictures are left out.
 """
 
 import pathlib

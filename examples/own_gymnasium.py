@@ -46,7 +46,7 @@ def main():
     policy, env = run.policy(), Heating()
     observation, _ = env.reset(seed=0)
     policy.reset()  # a policy with memory forgets the episode before
-    for step in range(96):
+    for _step in range(96):
         power = policy(observation)  # watts, as Heating wants them
         observation, *_ = env.step(power)
     print(f"after a day: {observation[0]:.1f} °C inside, {power[0]:.0f} W")

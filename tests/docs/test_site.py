@@ -8,8 +8,9 @@ import sys
 import types
 import zlib
 
-import credo
 import pytest
+
+import credo
 from credo.experiments.catalogue import EXPERIMENTS
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
