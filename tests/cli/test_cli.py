@@ -341,9 +341,10 @@ def test_a_preset_can_be_overridden_by_flags():
     options = line.command(train.Train)
     algorithm = train._algorithm(line, options)
     expected = Neuroevolution.ours(SequenceClassification(depth=5), MMU(), episodes=7)
-    mutation = dataclasses.replace(expected.mutation, strength=0.3)
+    mutation = dataclasses.replace(expected.breeder.mutation, strength=0.3)
     assert type(algorithm) is Neuroevolution
-    assert algorithm == dataclasses.replace(expected, mutation=mutation)
+    breeder = dataclasses.replace(expected.breeder, mutation=mutation)
+    assert algorithm == dataclasses.replace(expected, breeder=breeder)
     assert options.seed == 4
 
 
@@ -432,7 +433,7 @@ def test_several_seeds_are_trained_in_processes_of_their_own(credo, run, tmp_pat
     assert (runs[1] / "metrics.csv").read_bytes() == (run / "metrics.csv").read_bytes()
     code, *_ = credo("report", *map(str, runs), f"-o {tmp_path / 'both.html'}")
     assert code == 0
-    assert "Neuroevolution: 2, 3" in (tmp_path / "both.html").read_text()
+    assert "neuroevolution: 2, 3" in (tmp_path / "both.html").read_text()
 
 
 @pytest.fixture
@@ -494,12 +495,12 @@ def test_what_resume_is_told_reaches_the_loop(credo, seeds, run, monkeypatch):
     assert credo(f"resume {seeds} {words}")[0] == 0
     assert [path for path, _ in told] == [run, *sorted(pathlib.Path(seeds).glob("*"), reverse=True)]
     for _, fields in told:
-        assert fields["set"] == {"mutation.strength": 0.5, "episodes": 5}
+        assert fields["set"] == {"breeder.mutation.strength": 0.5, "episodes": 5}
         assert (fields["trust"], fields["without_replay"]) == (True, True)
     assert told[0][1]["wall_clock"] == 120.0
     told.clear()
     assert credo(f"resume {run} --set mutation-strength=0.25 --set elite_fraction=0.3")[0] == 0
-    assert told[0][1]["set"] == {"mutation.strength": 0.25, "elite_fraction": 0.3}
+    assert told[0][1]["set"] == {"breeder.mutation.strength": 0.25, "breeder.elite_fraction": 0.3}
     code, _, err = credo(f"resume {run} --set mutation.strngth=0.5")
     assert code == 2
     assert "did you mean 'strength'?" in err

@@ -8,12 +8,12 @@ import pytest
 
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.sequence_classification import SequenceClassification
+from credo.executors import local
 from credo.experiments import base, catalogue, fig_7_4
 from credo.experiments.base import Cell, Experiment, Trained, Value, grid, named
 from credo.experiments.views import Curves, Table, mean, published
 from credo.networks.mmu import MMU
 from credo.report.rows import Results, Row, read, rows, series, write
-from credo.runs import executor
 from credo.runs.record import RunError
 
 TINY = Neuroevolution.ours(
@@ -165,7 +165,7 @@ def test_reproduce_trains_once_and_repeats_itself(tmp_path, monkeypatch):
     def refuse(core):
         raise AssertionError("what is finished was trained again")
 
-    monkeypatch.setattr(executor, "_start", refuse)
+    monkeypatch.setattr(local, "_start", refuse)
     base.reproduce("fig-3.4a", "smoke", runs=1, jobs=1, **folders)
     assert results.read_bytes() == before
     assert html.read_bytes() == page

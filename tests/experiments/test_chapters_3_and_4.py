@@ -33,7 +33,7 @@ from credo.experiments.base import Cell, Trained, find
 from credo.networks.dmmu import DMMU
 from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
-from credo.report import page
+from credo.report import pages as page
 from credo.report import sections as report
 from credo.report.rows import Results, Row, Series, concat, read, rows, series, write
 from credo.rollout import evaluate

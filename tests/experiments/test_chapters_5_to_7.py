@@ -32,12 +32,13 @@ from credo.experiments.base import Trained, find
 from credo.learners.manager import UCB
 from credo.learners.sac import SAC
 from credo.learners.td3 import ddpg
-from credo.report import page, run_page
+from credo.report import pages as page
+from credo.report import run_page
 from credo.report import sections as report
 from credo.report.rows import Results, Row, Series, concat, read, rows, series, write
 from credo.rollout import evaluate
 from credo.runs import checkpoint, config, log
-from credo.runs.loop import Run
+from credo.runs.store import Run
 
 CHAPTERS = ("5", "6", "td3", "learners")
 ON_MUJOCO = [x for x in catalogue.EXPERIMENTS if x.partition("-")[2].startswith(CHAPTERS)]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from credo.experiments import base
-from credo.report import page
+from credo.report import pages as page
 from credo.report.rows import read
 
 ROOT = pathlib.Path(base.__file__).parents[3]

@@ -50,7 +50,7 @@ def fake(path, algorithm, seed, scores, frames=None):
         }
         for g, s in enumerate(scores)
     ]
-    log.Log(path, 0, tensorboard=False).append(rows, 1.0, 1.0)
+    log.Log(path, 0).append(rows, 1.0, 1.0)
     return path
 
 

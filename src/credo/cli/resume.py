@@ -57,8 +57,16 @@ def _in_full(algorithm: Any, changes: dict[str, Any]) -> dict[str, Any]:
     """Changes by the paths of fields, which short names such as gamma stand for."""
     line = Line("resume", [])
     line.take(algorithm)
-    meant = {
-        name: [path for path in line.flags if name.replace("_", "-") in shorts(path)]
-        for name in changes.keys() - line.flags.keys()
+
+    def meant(name: str) -> list[str]:
+        flags = {path: shorts(path) | {flag.name} for path, flag in line.flags.items()}
+        found = [path for path, names in flags.items() if name.replace("_", "-") in names]
+        inside = getattr(algorithm, "breeder", None)  # its fields need no prefix
+        bare = hasattr(inside, name.partition(".")[0])
+        return found or [f"breeder.{name}" if bare else name]
+
+    return {
+        path: value
+        for name, value in changes.items()
+        for path in ([name] if name in line.flags else meant(name))
     }
-    return {path: x for name, x in changes.items() for path in meant.get(name) or [name]}
