@@ -92,6 +92,7 @@ class Cell:
 
     @property
     def folder(self) -> str:
+        """The name, without what would be a folder of its own."""
         return self.name.replace("/", "-")
 
     @property
@@ -117,14 +118,17 @@ class Trained:
 
     @property
     def labels(self) -> Labels:
+        """Of the cell, and so of every row that is measured of it."""
         return self.cell.labels
 
     @property
     def seeds(self) -> list[int]:
+        """In the order of the runs."""
         return list(self.cell.seeds)
 
     @property
     def env(self) -> Any:
+        """The task that was trained on."""
         return self.cell.algorithm.env
 
     @cached_property
@@ -376,6 +380,7 @@ def describe(results: Results) -> Page:
 
 
 def sections(experiment: Experiment, results: Results) -> list[Section]:
+    """What the views of an experiment make of results, in order."""
     found: list[Section] = []
     for view in experiment.views:
         found += view(results, experiment.values) if callable(view) else [view]

@@ -356,6 +356,7 @@ def differing(lines: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def present(labels: Mapping[str, Any]) -> dict[str, Label]:
+    """Only the labels that are there."""
     return {name: value for name, value in labels.items() if value is not None}
 
 
@@ -367,4 +368,5 @@ def label_text(value: Any) -> page.Cell:
 
 
 def number(value: Any, scale: float = 1.0) -> float:
+    """A value of a series; NaN for null."""
     return np.nan if value is None else scale * float(value)
