@@ -199,7 +199,7 @@ def test_cells_of_chapter_4_have_the_published_sizes(name):
                 continue
             labels, algorithm = cell.labels, cell.algorithm
             assert (algorithm.population_size, algorithm.elites) == (100, 4)
-            islands = getattr(algorithm, "islands", None)
+            islands = algorithm.breeder.islands if hasattr(algorithm, "breeder") else None
             apart = (labels["task"], labels.get("partner")) == ("converge", "fsp")
             assert (islands is not None) == apart
             if maze:
@@ -260,7 +260,7 @@ def test_large_fleets_have_few_matrices_hit_whatever_their_network():
     for cell in fig_4_7.cells("published"):
         env, network = cell.algorithm.env, cell.algorithm.network
         matrices = len(jax.tree.leaves(network.init(*env.sizes, key=jax.random.key(0))))
-        hit = cell.algorithm.mutation.probability * matrices
+        hit = cell.algorithm.breeder.mutation.probability * matrices
         assert hit == pytest.approx(min(3.0, 0.9 * matrices))
         assert (env.servers, env.devices, env.scale) == (10, 20, (0.02, 1.0))
 
@@ -270,9 +270,9 @@ def test_beyond_4_asks_its_questions():
     for robots in (3, 4):
         name = f"spread, depth 2, robots {robots}, mmu"
         score, difference = cells[name], cells[f"{name}, difference"]
-        assert (score.signal, difference.signal) == ("score", "difference")
+        assert (score.reward, difference.reward) == ("score", "difference")
         assert score.env.reported == difference.env.reported == "score"
-        assert (score.network, score.mutation) == (difference.network, difference.mutation)
+        assert (score.network, score.breeder) == (difference.network, difference.breeder)
     networks = [cells[f"spread, depth 2, robots 2, {kind}"].network for kind in ("lstm", "gru")]
     assert [(x.cell, x.hidden) for x in networks] == [("lstm", 20), ("gru", 20)]
     deep = [cells[f"spread, depth 4, fsp, {network}"] for network in ("mmu", "ff")]

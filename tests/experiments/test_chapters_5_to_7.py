@@ -68,7 +68,7 @@ def fake(path, algorithm, seed, speed=1.0, **columns):
             table |= {f"selected_{i}": g % 4 == 1, f"discarded_{i}": g % 4 == 3}
             table[f"champion_share_{i}"] = np.full(GENERATIONS, 0.2)
     table |= columns
-    journal = log.Log(path, 0, tensorboard=False)
+    journal = log.Log(path, 0)
     for k in range(GENERATIONS):
         row = {"generation": k + 1} | {name: column[k].item() for name, column in table.items()}
         journal.append([row], 1.0, 5.0 + k / speed)

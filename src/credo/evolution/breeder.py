@@ -211,3 +211,9 @@ def evolving(breeder: Breeder, settings: dict[str, Any]) -> dict[str, Any]:
     settings = {"breeder": breeder} | settings
     own = {f.name: settings.pop(f.name) for f in fields(Breeder) if f.name in settings}
     return settings | {"breeder": replace(settings["breeder"], **own)}
+
+
+def altered(algorithm: Any, **changes: Any) -> Any:
+    """An algorithm with other settings, of which those that are fields of its breeder change the
+    breeder."""
+    return replace(algorithm, **evolving(algorithm.breeder, changes))

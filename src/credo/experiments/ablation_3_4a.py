@@ -8,6 +8,7 @@ import jax
 
 from ..analysis.generalization import first_mistakes
 from ..environments.curriculum import Curriculum
+from ..evolution.breeder import altered
 from ..report.rows import Row, rows
 from .base import Cell, Experiment, Trained
 from .dissertation import told
@@ -22,8 +23,8 @@ INGREDIENTS: dict[str, Callable[[Any], dict[str, Any]]] = {  # fields of our alg
     "without persistent signals": lambda x: {"curriculum": Curriculum()},
     "with the author's fitness": lambda x: {"fitness": ()},
     "without parsimony": lambda x: {"parsimony": None},
-    "without erasing": lambda x: {"mutation": replace(x.mutation, reset_probability=0.0)},
-    "without limit": lambda x: {"mutation": replace(x.mutation, limit=1e12)},
+    "without erasing": lambda x: {"mutation": replace(x.breeder.mutation, reset_probability=0.0)},
+    "without limit": lambda x: {"mutation": replace(x.breeder.mutation, limit=1e12)},
     "with elite memory of 6": lambda x: {"elite_memory": 6},
     "without crossover": lambda x: {"cross_repeated": False},
 }
@@ -35,7 +36,7 @@ def cells(budget: str) -> list[Cell]:
     seeds = ours.seeds[: max(len(ours.seeds) // 2, 2)]
 
     def changed(name: str, fields: dict[str, Any]) -> Cell:
-        algorithm = replace(ours.algorithm, **fields)
+        algorithm = altered(ours.algorithm, **fields)
         return Cell({**ours.labels, "change": name}, algorithm, seeds, ours.generations)
 
     return [ours, *(changed(name, f(ours.algorithm)) for name, f in INGREDIENTS.items())]

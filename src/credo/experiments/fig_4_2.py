@@ -12,6 +12,7 @@ from ..algorithms.ccea import CCEA
 from ..algorithms.neuroevolution import author_mutation
 from ..analysis import maze_trace, statistics, tmaze
 from ..environments.extended_tmaze import ExtendedTMaze
+from ..evolution.breeder import altered
 from ..evolution.islands import Islands
 from ..networks.base import AbstractNetwork
 from ..networks.mlp import MLP
@@ -83,7 +84,7 @@ def cell(
     large, tiny = NETWORKS[network]
     algorithm = CCEA.ccea(env, large, **fields)
     if budget == "smoke":
-        algorithm = replace(algorithm, network=tiny, **SMOKE)
+        algorithm = altered(algorithm, network=tiny, **SMOKE)
     generations, runs = full(env, network) if budget == "full" else PLANS[budget]
     return Cell(labels, algorithm, range(500, 500 + runs), generations)  # chosen on other seeds
 

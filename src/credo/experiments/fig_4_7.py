@@ -14,6 +14,7 @@ from ..algorithms.neuroevolution import Neuroevolution
 from ..analysis import fleet
 from ..environments.server_fleet import ServerFleet
 from ..environments.wrappers import NoisyObservations
+from ..evolution.breeder import altered
 from ..evolution.mutation import MatrixMutation
 from ..networks.base import AbstractNetwork
 from ..networks.dmmu import DMMU, DMMUPolicy
@@ -77,7 +78,7 @@ def cell(
     algorithm = Neuroevolution.dmmu(env, network, **fields)
     if budget == "smoke":
         sizes = {"population_size": 6, "elite_fraction": 0.2, "episodes": 2, "test_episodes": 2}
-        algorithm = replace(algorithm, **sizes)
+        algorithm = altered(algorithm, **sizes)
     generations, runs = plan
     seeds = range(200, 200 + runs)  # settings were chosen by looking at lower ones
     return Cell(labels, algorithm, seeds, generations)

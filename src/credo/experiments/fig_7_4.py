@@ -9,6 +9,7 @@ import numpy as np
 from ..algorithms.merl import LOCAL, MERL
 from ..algorithms.off_policy import OffPolicy
 from ..environments.rover import Rover
+from ..evolution.breeder import altered
 from ..learners.td3 import maddpg, matd3
 from ..networks.team import Team
 from ..report.rows import Labels
@@ -92,7 +93,7 @@ def cell(
     if network is not None:
         algorithm = dataclasses.replace(algorithm, network=network)
     if isinstance(algorithm, MERL):
-        algorithm = dataclasses.replace(algorithm, **settings)
+        algorithm = altered(algorithm, **settings)
     if budget == "smoke":
         algorithm = shrunk(algorithm)
     seeds = range(first_seed, first_seed + planned.runs)
