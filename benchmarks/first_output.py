@@ -9,7 +9,7 @@ import tempfile
 import time
 
 GOALS = {"cold": 15.0, "warm": 6.0}
-COMMAND = [sys.executable, "-m", "credo.cli", "train", "neuroevolution", "sequence-classification"]
+COMMAND = [sys.executable, "-m", "credo", "train", "neuroevolution", "sequence-classification"]
 
 
 def main() -> None:

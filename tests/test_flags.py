@@ -29,9 +29,9 @@ ALONE = LEARN | {"start_frames": 5}
 HYBRID = EVOLUTION | LEARN | {"warmup_frames": 5, "workers": 1}
 COPY, MEET = Copy(max_steps=4), Meet()
 MAKE = {
-    "neuroevolution": lambda: Neuroevolution(COPY, NETWORK, **EVOLUTION),
+    "neuroevolution": lambda: Neuroevolution.as_written(COPY, NETWORK, **EVOLUTION),
     "bptt": lambda: BPTT(Remember(2), MMU(hidden=2), batch_size=2, test_episodes=1),
-    "ccea": lambda: CCEA(MEET, NETWORK, teams=1, **EVOLUTION),
+    "ccea": lambda: CCEA.ccea(MEET, NETWORK, teams=1, **EVOLUTION),
     "erl": lambda: ERL.erl(COPY, NETWORK, learners=(ddpg(**TINY),), **HYBRID),
     "cerl": lambda: ERL.cerl(COPY, NETWORK, learners=(TD3(**TINY),), **HYBRID),
     "ea": lambda: ERL.ea(COPY, NETWORK, **HYBRID),

@@ -7,7 +7,7 @@ import credo
 
 ROOT = pathlib.Path(credo.__file__).parent
 LEVELS = [
-    {"types", "tree", "compilation", "require", "memory", "runner"},
+    {"types", "tree", "compilation", "require", "memory", "runner", "fields"},
     {"environments", "networks"},
     {"rollout", "replay"},
     {"normalization"},

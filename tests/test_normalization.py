@@ -53,11 +53,11 @@ class Raw(Copy):
 
 
 MAKE = {
-    "neuroevolution": lambda **on: Neuroevolution(Raw(), NETWORK, **EVOLUTION, **on),
-    "ccea": lambda **on: CCEA(Meet(), NETWORK, teams=1, **EVOLUTION, **on),
+    "neuroevolution": lambda **on: Neuroevolution.as_written(Raw(), NETWORK, **EVOLUTION, **on),
+    "ccea": lambda **on: CCEA.ccea(Meet(), NETWORK, teams=1, **EVOLUTION, **on),
     "ea": lambda **on: ERL.ea(Raw(), NETWORK, **HYBRID, **on),
     "erl": lambda **on: ERL.erl(Raw(), NETWORK, learners=(TD3(**TINY),), **HYBRID, **on),
-    "merl": lambda **on: MERL(
+    "merl": lambda **on: MERL.merl(
         Meet(), Team(trunk=(2,)), learners=(TD3(signal="local", **TINY),), **HYBRID, **on
     ),
     "td3": lambda **on: OffPolicy.td3(

@@ -13,16 +13,20 @@ from reading import read
 from walk import START, HostWalk, Walk, Walkers
 
 from credo import rollout, tree
-from credo.environments.host import InTurn
+from credo.environments.host import EnvironmentFailure, InTurn
 from credo.environments.probes import Copy, Meet, Remember
+from credo.environments.rover import Rover
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
-from credo.environments.wrappers import Given, delayed
+from credo.environments.server_fleet import ServerFleet
+from credo.environments.wrappers import Given, NoisyObservations, Shortened, delayed
 from credo.networks.base import AbstractPolicy
+from credo.networks.dmmu import DMMU
 from credo.networks.exploration import Explorer, GaussianNoise
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
+from credo.networks.team import Team
 
 POP, EPISODES = 3, 4
 CLASSIFICATION = SequenceClassification(depth=3, min_gap=1, max_gap=3)
@@ -628,3 +632,75 @@ def test_large_policies_play_in_turn_what_they_play_together(common, monkeypatch
     apart = rollout.evaluate(Copy(), population, EPISODES, common=common, key=key)
     np.testing.assert_allclose(apart.returns["reward"], together.returns["reward"], atol=1e-5)
     assert np.unique(np.asarray(apart.returns["reward"])).size >= POP * EPISODES - 2  # some are cut
+
+
+# Recording: the episode that `evaluate` plays, moment by moment.
+
+
+RECORDED = {
+    "rovers": (Rover(coupling=2, rovers=3, pois=2, size=8.0, max_steps=9), Team((4,))),
+    "fleet": (ServerFleet.case_study(), DMMU(hidden=3, order="random")),
+    "noise": (delayed(NoisyObservations(RECALL, 0.1)), MMU(hidden=3)),
+    "shortened": (Shortened(CLASSIFICATION, 1), Recurrent("lstm", 3)),
+    "outside": (delayed(HostWalk(spread=0.5)), Recurrent("gru", 3)),
+}
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_what_is_recorded_is_what_evaluation_plays(name):
+    env, network = RECORDED[name]
+    policy = network.init(*env.sizes, key=jax.random.key(1))
+    for seed in range(3, 6):
+        trace = rollout.record(env, policy, key=jax.random.key(seed))
+        played = rollout.evaluate(env, tree.stack(policy), 1, key=jax.random.key(seed))
+        steps = int(trace.length)
+        assert played.steps.item() == steps == len(trace.actions)
+        assert trace.terminated != trace.truncated
+        seen = jax.tree.leaves((trace.observations, trace.states, trace.carries))
+        assert {len(x) for x in seen} == {steps + 1}
+        assert all(isinstance(x, np.ndarray | np.generic) for x in jax.tree.leaves(trace))
+        assert np.abs(trace.actions).max() <= 1.0
+        for reward, paid in trace.rewards.items():
+            np.testing.assert_allclose(
+                paid.sum(axis=0), played.returns[reward][0, 0], rtol=1e-5, atol=1e-6
+            )
+
+
+def test_a_carry_leads_from_each_observation_to_the_action():
+    env, network = RECORDED["outside"]
+    policy = network.init(*env.sizes, key=jax.random.key(1))
+    for task in (env, delayed(Walk())):
+        trace = rollout.record(task, policy, key=jax.random.key(0))
+        actions, carries = read(policy, trace.observations[:-1])
+        np.testing.assert_allclose(actions, trace.actions, atol=1e-6)
+        np.testing.assert_allclose(carries, trace.carries[1:], atol=1e-6)
+
+
+def test_a_padded_record_holds_the_same_under_vmap():
+    env, network = RECORDED["rovers"]
+    policy = network.init(*env.sizes, key=jax.random.key(1))
+    keys = jax.random.split(jax.random.key(0), 3)
+    padded = jax.vmap(lambda key: rollout.record(env, policy, key=key, padded=True))(keys)
+    assert padded.actions.shape[:2] == (3, env.max_steps)
+    for i, key in enumerate(keys):
+        one = jax.tree.map(lambda x, i=i: x[i], padded).cut()
+        alone = rollout.record(env, policy, key=key)
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_a_record_outside_jax_takes_a_seed_and_is_seen_at_every_moment():
+    seen = []
+    policy = MLP((3,)).init(2, 1, key=jax.random.key(0))
+    trace = rollout.record(HostWalk(), policy, key=jax.random.key(0), seed=5, see=seen.append)
+    assert seen == [False] * int(trace.length) + [True]
+    with pytest.raises(EnvironmentFailure, match="the episode failed, or its policy said NaN"):
+        rollout.record(HostWalk(), Constant(jnp.full(1, jnp.nan)), key=jax.random.key(0))
+
+
+def test_the_task_within_is_one_property_away():
+    assert delayed(NoisyObservations(RECALL, 0.1)).unwrapped is RECALL
+    assert Shortened(CLASSIFICATION, 1).unwrapped is CLASSIFICATION
+    host = HostWalk()
+    assert delayed(delayed(host)).unwrapped is host
+    assert host.unwrapped is host

@@ -113,11 +113,20 @@ def test_a_packed_member_is_few_arrays_and_comes_back():
     members = Member(
         jnp.arange(12.0).reshape(2, 3, 2), jnp.arange(8.0).reshape(2, 4), jnp.array([[1], [2]])
     )
-    pack, unpack = tree.packing(members)
-    rows = eqx.filter_vmap(pack)(members)
+    rows, each, unpack = tree.packed(members)
     assert [x.shape for x in jax.tree.leaves(rows)] == [(2, 10), (2, 1)]
-    back = eqx.filter_vmap(unpack)(tree.take(rows, jnp.array([1, 0])))
-    assert eqx.tree_equal(back, tree.take(members, jnp.array([1, 0])))
+    swapped = tree.take(rows, jnp.array([1, 0]))
+    assert eqx.tree_equal(unpack(swapped), tree.take(members, jnp.array([1, 0])))
+    keys = []
+
+    def plus(a, b, *, key):
+        keys.append(key)
+        return eqx.tree_at(lambda m: (m.w, m.v), a, (a.w + b.w, a.v + b.v))
+
+    sums = unpack(each(plus, rows, swapped, key=jax.random.key(0)))
+    np.testing.assert_array_equal(sums.v, np.stack([4.0 + 2.0 * np.arange(4)] * 2))
+    np.testing.assert_array_equal(sums.count, members.count)
+    assert len(keys) == 1  # one program for all members
 
 
 def test_large_members_go_in_batches(monkeypatch):

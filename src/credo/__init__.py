@@ -9,86 +9,18 @@ policy = run.policy()
 action = policy(observation)
 """
 
+import ast
 import importlib
+import pathlib
 
+_STUB = pathlib.Path(__file__).with_name("__init__.pyi")
 _EXPORTS = {
-    "SequenceClassification": "environments.sequence_classification",
-    "SequenceRecall": "environments.sequence_recall",
-    "AbstractEnvironment": "environments.base",
-    "AbstractSequenceTask": "environments.base",
-    "check_environment": "environments.checks",
-    "MMU": "networks.mmu",
-    "Recurrent": "networks.recurrent",
-    "MLP": "networks.mlp",
-    "AbstractNetwork": "networks.base",
-    "AbstractPolicy": "networks.base",
-    "AbstractSelection": "evolution.selection",
-    "AbstractMutation": "evolution.mutation",
-    "AbstractCrossover": "evolution.crossover",
-    "Curriculum": "evolution.curriculum",
-    "Parsimony": "evolution.parsimony",
-    "Tournament": "evolution.selection",
-    "Truncation": "evolution.selection",
-    "MatrixMutation": "evolution.mutation",
-    "GaussianMutation": "evolution.mutation",
-    "MaskedCrossover": "evolution.crossover",
-    "OnePointCrossover": "evolution.crossover",
-    "AgentCrossover": "evolution.agents",
-    "Homogenize": "evolution.agents",
-    "Mutations": "evolution.mutation",
-    "Extinction": "evolution.extinction",
-    "Islands": "evolution.islands",
-    "Neuroevolution": "algorithms.neuroevolution",
-    "Sequence": "types",
-    "TimeStep": "types",
-    "evaluate": "rollout",
-    "train": "runs.loop",
-    "resume": "runs.loop",
-    "Run": "runs.store",
-    "RunOptions": "runs.options",
-    "Callback": "runs.callbacks",
-    "Policy": "runs.policy",
-    "ERL": "algorithms.erl",
-    "OffPolicy": "algorithms.off_policy",
-    "MERL": "algorithms.merl",
-    "CCEA": "algorithms.ccea",
-    "DMMU": "networks.dmmu",
-    "ExtendedTMaze": "environments.extended_tmaze",
-    "ServerFleet": "environments.server_fleet",
-    "Team": "networks.team",
-    "Centralized": "networks.team",
-    "JointCritic": "networks.team",
-    "Rover": "environments.rover",
-    "SimpleSpread": "environments.simple_spread",
-    "PettingZoo": "environments.pettingzoo",
-    "to_pettingzoo": "environments.pettingzoo",
-    "matd3": "learners.td3",
-    "maddpg": "learners.td3",
-    "AbstractLearner": "learners.base",
-    "TD3": "learners.td3",
-    "ddpg": "learners.td3",
-    "SAC": "learners.sac",
-    "PPO": "algorithms.ppo",
-    "BPTT": "algorithms.bptt",
-    "AbstractCritic": "networks.mlp",
-    "AbstractCriticNetwork": "networks.mlp",
-    "Critic": "networks.mlp",
-    "ResidualCritic": "networks.mlp",
-    "Explorer": "networks.exploration",
-    "GaussianNoise": "networks.exploration",
-    "OrnsteinUhlenbeck": "networks.exploration",
-    "AbstractManager": "learners.manager",
-    "UCB": "learners.manager",
-    "Uniform": "learners.manager",
-    "Thompson": "learners.manager",
-    "AbstractHostEnvironment": "environments.host",
-    "Gymnasium": "environments.gymnasium",
-    "delayed": "environments.wrappers",
-    "NoisyObservations": "environments.wrappers",
-    "Runner": "runner",
-    "export": "runs.export",
-    "watch": "report.watch",
+    name.name: node.module
+    for node in ast.parse(_STUB.read_text(encoding="utf-8")).body
+    if isinstance(node, ast.ImportFrom)
+    for name in node.names
 }
+"""The module of each public name: `__init__.pyi` has them, with their types for editors."""
 __all__ = sorted(_EXPORTS)  # pyright: ignore[reportUnsupportedDunderAll]
 
 

@@ -84,19 +84,13 @@ def _cannot_learn(env: Any, has: str, learners: Iterable[Any]) -> str:
 
 
 def room(
-    elite_fraction: float, population: int, learners: int, workers: int, of: str = "members"
+    elite_fraction: float, population: int, learners: int, of: str = "members", least: int = 1
 ) -> None:
-    """A population with elites, and slots for the actors of learners that all play."""
-    within("elite_fraction", elite_fraction, 0, 1)
-    if not 1 <= int(elite_fraction * population) <= population - max(1, learners):
-        enough = math.ceil(1000 / population) / 1000
+    """A population with `least` elites or more, and slots for the actors of learners."""
+    if not least <= int(elite_fraction * population) <= population - max(1, learners):
+        enough = math.ceil(1000 * least / population) / 1000
         raise ValueError(
-            f"elite_fraction is {elite_fraction} of {population} {of}: that must be at least 1, "
-            f"and leave {max(1, learners)} for offspring; give {enough:g} or more, or a larger "
-            "population"
-        )
-    if workers < learners:
-        raise ValueError(
-            f"{workers} workers for {learners} learners: some would never play; give at least as "
-            "many"
+            f"elite_fraction is {elite_fraction} of {population} {of}: that must be at least "
+            f"{least}, and leave {max(1, learners)} for offspring; give {enough:g} or more, or a "
+            "larger population"
         )

@@ -4,10 +4,10 @@ There are two ways in. A population plays for its returns: `evaluate`, and `coll
 keeps the transitions. One policy is looked at: `record` keeps an episode of it, moment by moment.
 """
 
+import dataclasses
 import functools
-import itertools
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,19 +18,13 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from . import tree
 from .compilation import float32, jit
 from .environments.base import AbstractEnvironment, AbstractSequenceTask, correct
-from .environments.host import (
-    AbstractCopies,
-    AbstractHostEnvironment,
-    EnvironmentFailure,
-    Episodes,
-    HostStep,
-    sound,
-)
+from .environments.host import AbstractHostEnvironment, EnvironmentFailure, Episodes, sound
 from .environments.wrappers import Given
 from .networks.base import AbstractPolicy
 from .types import Evaluation, Sequence, Trace, Transition, plain
 
 Environment = AbstractEnvironment | AbstractHostEnvironment
+See = Callable[[bool], None]
 
 
 class Experience(eqx.Module):
@@ -105,18 +99,27 @@ def collect(
 
 @float32()
 def record(
-    env: Environment, policy: AbstractPolicy, *, key: PRNGKeyArray, padded: bool = False
+    env: Environment,
+    policy: AbstractPolicy,
+    *,
+    key: PRNGKeyArray,
+    padded: bool = False,
+    seed: int | None = None,
+    see: See = lambda over: None,
 ) -> Trace:
     """The episode that `evaluate(env, tree.stack(policy), 1, key=key)` plays, moment by moment.
 
-    **Arguments:** `padded`, for use under `jit` and `vmap`: the arrays of a task in JAX have room
-    for `max_steps` steps; what stands behind `length` means nothing. Otherwise they end there, in
-    NumPy.
+    **Arguments:**
+
+    - `padded`, of a task in JAX, for use under `jit` and `vmap`: arrays have room for `max_steps`
+      steps, and what stands behind `length` means nothing. Otherwise they end there, in NumPy.
+    - `seed`, of a task outside JAX: that of its reset; None: one drawn by `key`.
+    - `see(over)`, of a task outside JAX: called at every moment, to draw it.
 
     **Raises:** `EnvironmentFailure` if the episode of a task outside JAX failed.
     """
     if isinstance(env, AbstractHostEnvironment):
-        return _record_on_host(env, policy, key=key)
+        return _record_on_host(env, policy, seed, see, key=key)
     trace = _record(env, policy, key=key)
     return trace if padded else trace.cut()
 
@@ -258,82 +261,47 @@ def _record(env: AbstractEnvironment, policy: AbstractPolicy, *, key: PRNGKeyArr
     carry = policy.start(key=jax.random.split(policy_key, (1, 1))[0, 0])
 
     def advance(loop, t):
-        state, obs, carry = loop
+        state, (obs, active), carry = loop
         action, carry = policy(obs, carry)
         action = jnp.clip(jnp.where(jnp.isfinite(action), action, 0.0), -1.0, 1.0)
         state, now = env.step(state, action, key=jax.random.fold_in(step_key, t))
-        seen = (now.obs, state, now.active, carry)
-        return (state, now.obs, carry), (seen, action, now.rewards, now.terminated, now.truncated)
+        done = (action, now.rewards, active, now.terminated, now.truncated)
+        return (state, (now.obs, now.active), carry), ((now.obs, state, carry), done)
 
-    _, (later, actions, rewards, *ends) = jax.lax.scan(
-        advance, (state, first.obs, carry), jnp.arange(env.max_steps)
-    )
-    start = (first.obs, state, first.active, carry)
-    seen = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), start, later)
-    over = ends[0] | ends[1]
+    start = (state, (first.obs, first.active), carry)
+    _, (later, done) = jax.lax.scan(advance, start, jnp.arange(env.max_steps))
+    seen = (first.obs, state, carry)
+    seen = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), seen, later)
+    actions, rewards, active, terminated, truncated = done
+    over = terminated | truncated
     last = jnp.where(jnp.any(over), jnp.argmax(over), env.max_steps - 1)
-    return Trace(*seen, actions, rewards, ends[0][last], ends[1][last], last + 1)
-
-
-class Moment(NamedTuple):
-    """A policy and one copy of a task outside JAX, before its next step."""
-
-    obs: np.ndarray
-    active: np.ndarray | None  # of a team: who acts now
-    carry: PyTree
-    action: np.ndarray | None = None  # that led here; None: it is the start
-    step: HostStep | None = None
-
-
-def moments(
-    copies: AbstractCopies, policy: AbstractPolicy, seed: int | None = None, *, key: PRNGKeyArray
-) -> Iterator[Moment]:
-    """What `record` keeps of a task outside JAX, while it happens: for films.
-
-    **Arguments:** `copies`: one; `seed` of its reset: None: the one that `key` draws.
-
-    **Raises:** `EnvironmentFailure` if the episode fails.
-    """
-    form, arrays = _apart(tree.stack(policy))
-    drawn, carry = _start_on_host(form, arrays, (1, 1), True, key)
-    everyone = np.ones(1, bool)
-    seed = np.asarray(drawn).item() if seed is None else seed
-    obs, active, now = copies.reset(np.array([seed], np.uint32), everyone), None, None
-    failed, action = copies.failed, None
-    while True:
-        if failed is not None and failed[0]:
-            raise EnvironmentFailure(copies.failure_text(0))
-        one = jax.tree.map(lambda x: x[0, 0], carry)
-        yield Moment(obs[0], None if active is None else active[0], one, action, now)
-        if now is not None and (now.terminated[0] or now.truncated[0]):
-            return
-        said, carry = _act_on_host(form, arrays, obs, carry)
-        said = np.asarray(said)
-        played = np.clip(np.where(np.isfinite(said), said, np.float32(0.0)), -1.0, 1.0)
-        now = copies.step(played, everyone)
-        obs, active, failed, action = now.obs, now.active, now.failed, played[0]
+    ends = (terminated[last], truncated[last], last + 1)
+    return Trace(seen[0], seen[1], seen[2], actions, rewards, active, *ends)
 
 
 def _record_on_host(
-    env: AbstractHostEnvironment, policy: AbstractPolicy, *, key: PRNGKeyArray
+    env: AbstractHostEnvironment, policy: AbstractPolicy, seed: int | None, see: See, *, key
 ) -> Trace:
-    start, *later = itertools.islice(moments(env.copies(1), policy, key=key), env.max_steps + 1)
-    steps = [moment.step for moment in later if moment.step is not None]
-    active = None
-    if env.agents is not None:
-        active = np.stack([np.ones(env.agents, bool), *(m.active for m in later)])
-    seen = [start, *later]
-    return Trace(
-        np.stack([m.obs for m in seen]),
-        None,
-        active,
-        jax.tree.map(lambda *xs: plain(jnp.stack(xs)), *(m.carry for m in seen)),
-        np.stack([m.action for m in later]),
-        {name: np.stack([now.rewards[name][0] for now in steps]) for name in env.signals},
-        steps[-1].terminated[0],
-        steps[-1].truncated[0] | ~steps[-1].terminated[0],
-        np.int32(len(steps)),
-    )
+    form, arrays = _apart(tree.stack(policy))
+    drawn, carry = _start_on_host(form, arrays, (1, 1), True, key)
+    seeds = np.array([np.asarray(drawn).item() if seed is None else seed], np.uint32)
+    told, carries = Episodes(env, 1, True), [carry]
+    obs = told.begin(seeds, np.ones(1, bool))
+    see(not told.ongoing)
+    while told.ongoing:
+        action, carry = _act_on_host(form, arrays, obs, carry)
+        obs = told.advance(np.asarray(action))
+        carries.append(carry)
+        see(not told.ongoing)
+    seen, actions, rewards, later, _, truncated, active = told.rows()
+    if not len(seen):
+        why = env.copies(1).failure_text(0)
+        raise EnvironmentFailure(f"the episode failed, or its policy said NaN: {why}")
+    seen = np.concatenate([seen, later[-1:]])
+    kept = jax.tree.map(lambda *xs: plain(jnp.stack(xs))[:, 0, 0], *carries)
+    played = (np.clip(actions, -1.0, 1.0), rewards, active)
+    ends = (~truncated[-1], truncated[-1], np.int32(len(actions)))
+    return Trace(seen, None, kept, *played, *ends)
 
 
 def _play_on_host(
@@ -365,21 +333,13 @@ def _play_on_host(
     return Evaluation(*sums), Experience(Transition(*told.rows()), None)
 
 
+@dataclasses.dataclass(frozen=True)
 class _Form:
-    """A population without its arrays: what a program is compiled for. Hashed once, since
-    `equinox.filter_jit` would look at every leaf anew at every step, which takes longer than the
-    step."""
+    """A population without its arrays: what a program is compiled for. `equinox.filter_jit` would
+    look at every leaf anew at every step, which takes longer than the step."""
 
-    def __init__(self, structure: Any, rest: tuple[Any, ...]):
-        self.structure, self.rest = structure, rest
-        self.hash = hash((structure, rest))
-
-    def __hash__(self) -> int:
-        return self.hash
-
-    def __eq__(self, other: object) -> bool:
-        same = isinstance(other, _Form) and self.structure == other.structure
-        return self is other or (same and self.rest == other.rest)
+    structure: Any
+    rest: tuple[Any, ...]
 
     def filled(self, arrays: list[Array | None]) -> PyTree:
         """The population again."""

@@ -1,6 +1,5 @@
 """A population is a pytree whose array leaves carry a leading axis `[pop]`."""
 
-import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +9,7 @@ import jax
 import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 CACHED = 250_000  # numbers that stay in a core's cache
 
@@ -63,10 +62,13 @@ def where(pred: Bool[Array, ""], a: PyTree, b: PyTree) -> PyTree:
     return jax.tree.map(lambda x, y: jnp.where(pred, x, y) if eqx.is_array(x) else x, a, b)
 
 
-def packing(population: PyTree) -> tuple[Callable[[PyTree], PyTree], Callable[[PyTree], PyTree]]:
-    """How to write a member of this population as few arrays, its weights as one, and back.
+def packed(population: PyTree) -> tuple[PyTree, Callable[..., PyTree], Callable[..., PyTree]]:
+    """A population with all weights of a member as one vector, the first part of the result.
 
-    What is then done to a whole population is a few operations. For each leaf on its own it would
+    **Returns:** the packed population; `each(operator, *parents, key=key)`, what an operator on
+    genomes makes of each of some packed parents; and how a packed population is unpacked.
+
+    Operators are then a few operations for a whole population. For each leaf on its own they would
     be some per matrix, and a team of ten has a hundred and thirty: a minute of compiling.
     """
     _, unravel, _ = ravel(take(population, 0))
@@ -80,7 +82,14 @@ def packing(population: PyTree) -> tuple[Callable[[PyTree], PyTree], Callable[[P
         vector, arrays = packed
         return eqx.combine(eqx.filter(unravel(vector), eqx.is_inexact_array), arrays, static)
 
-    return pack, unpack
+    def each(operator: Callable[..., PyTree], *parents: PyTree, key: PRNGKeyArray) -> PyTree:
+        def one(given):
+            key, *genomes = given
+            return pack(operator(*map(unpack, genomes), key=key))
+
+        return in_batches(jax.vmap(one), (jax.random.split(key, size(parents[0])), *parents))
+
+    return eqx.filter_vmap(pack)(population), each, eqx.filter_vmap(unpack)
 
 
 def batch(members: PyTree) -> int:
@@ -123,9 +132,7 @@ class Layout(eqx.Module):
         return int(self.row[-1]) + 1
 
 
-def ravel(
-    genome: PyTree,
-) -> tuple[Float[Array, " entries"], Callable[[Array], PyTree], Layout]:
+def ravel(genome: PyTree) -> tuple[Float[Array, " entries"], Callable[..., PyTree], Layout]:
     """All inexact array leaves of one genome as a vector, the way back, and the layout.
 
     Operators work on the vector: leaf by leaf they would be one program per matrix, and an MMU
@@ -133,19 +140,14 @@ def ravel(
     """
     weights, rest = eqx.partition(genome, eqx.is_inexact_array)
     vector, unravel = jax.flatten_util.ravel_pytree(weights)
-    leaves = [np.zeros(leaf.shape) for leaf in jax.tree.leaves(weights)]
-    rows = list(itertools.accumulate((len(np.atleast_1d(x)) for x in leaves), initial=0))
+    shapes = [leaf.shape for leaf in jax.tree.leaves(weights)]
+    sizes = np.array([math.prod(shape) for shape in shapes])
+    rows = np.array([(*shape, 1)[0] for shape in shapes])  # of each leaf
     layout = Layout(
-        leaf=np.concatenate([np.full(x.size, i) for i, x in enumerate(leaves)]),
-        row=np.concatenate(
-            [
-                first + np.repeat(np.arange(count), x.size // count)
-                for first, x in zip(rows, leaves, strict=False)
-                for count in (len(np.atleast_1d(x)),)
-            ]
-        ),
-        place=np.concatenate([np.arange(x.size) for x in leaves]),
-        matrix=np.concatenate([np.full(x.size, x.ndim > 1) for x in leaves]),
-        sizes=np.array([x.size for x in leaves]),
+        leaf=np.repeat(np.arange(len(shapes)), sizes),
+        row=np.repeat(np.arange(rows.sum()), np.repeat(sizes // rows, rows)),
+        place=np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes),
+        matrix=np.repeat([len(shape) > 1 for shape in shapes], sizes),
+        sizes=sizes,
     )
     return vector, lambda vector: eqx.combine(unravel(vector), rest), layout

@@ -97,15 +97,15 @@ class Trace(eqx.Module):
     Moments are counted from 0, the start, to `length`; step t leads from moment t to t + 1.
     """
 
-    observations: Float[Array, "moments *agents obs"]
+    observations: Float[Any, "moments *agents obs"]
     states: PyTree  # of a task in JAX, leaves [moments, ...]; None: the task is outside JAX
-    active: Bool[Array, "moments agents"] | None  # who acts in the step to come; None: no team
     carries: PyTree  # the policy's memory, leaves [moments, ...]
-    actions: Float[Array, "steps *agents act"]  # as they were played: finite, in [-1, 1]
-    rewards: dict[str, Float[Array, "steps *agents"]]
-    terminated: Bool[Array, ""]  # the task ended the episode
-    truncated: Bool[Array, ""]  # the clock did
-    length: Int[Array, ""]  # steps
+    actions: Float[Any, "steps *agents act"]  # as they were played: finite, in [-1, 1]
+    rewards: dict[str, Float[Any, "steps *agents"]]
+    active: Bool[Any, "steps agents"] | None  # whose action counted; None: no team
+    terminated: Bool[Any, ""]  # the task ended the episode
+    truncated: Bool[Any, ""]  # the clock did
+    length: Int[Any, ""]  # steps
 
     def cut(self) -> "Trace":
         """Without padding, in NumPy."""
@@ -114,13 +114,20 @@ class Trace(eqx.Module):
         def until(last: int, part: Any) -> Any:
             return jax.tree.map(lambda x: plain(x)[:last], part)
 
-        seen = (self.observations, self.states, self.active, self.carries)
-        done = (self.actions, self.rewards)
-        ends = map(np.asarray, (self.terminated, self.truncated, self.length))
-        return Trace(*until(steps + 1, seen), *until(steps, done), *ends)
+        return Trace(
+            observations=until(steps + 1, self.observations),
+            states=until(steps + 1, self.states),
+            carries=until(steps + 1, self.carries),
+            actions=until(steps, self.actions),
+            rewards=until(steps, self.rewards),
+            active=until(steps, self.active),
+            terminated=np.asarray(self.terminated),
+            truncated=np.asarray(self.truncated),
+            length=np.int32(steps),
+        )
 
 
-def plain(x: Array) -> np.ndarray:
+def plain(x: Array | np.ndarray) -> np.ndarray:
     """An array in NumPy; of random keys their bits."""
     if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
         x = jax.random.key_data(x)

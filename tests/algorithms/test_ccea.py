@@ -1,15 +1,13 @@
 """CCEA: who is in which team, what each member is assigned, and that agents coevolve."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from evolved import evolved
 
 from credo import tree
-from credo.algorithms.ccea import CCEA, assigned
-from credo.algorithms.ccea import bred as bred_by
+from credo.algorithms.ccea import CCEA, assigned, breed
 from credo.environments.extended_tmaze import ExtendedTMaze
 from credo.environments.probes import Meet
 from credo.evolution.extinction import Extinction
@@ -18,11 +16,13 @@ from credo.evolution.mutation import MatrixMutation
 from credo.networks.dmmu import DMMU
 from credo.networks.mlp import MLP
 
-SMALL = CCEA(Meet(), MLP(hidden=(4,)), population_size=6, elite_fraction=0.2, teams=3, episodes=2)
+SMALL = CCEA.ccea(
+    Meet(), MLP(hidden=(4,)), population_size=6, elite_fraction=0.2, teams=3, episodes=2
+)
 
 
 def test_random_teams_are_k_phi_draws_from_each_population():
-    many = CCEA(Meet(), population_size=20, elite_fraction=0.1, teams=50)
+    many = CCEA.ccea(Meet(), population_size=20, elite_fraction=0.1, teams=50)
     members = np.asarray(many.drawn(key=jax.random.key(0)))
     assert members.shape == (2, 1000)
     counts = [np.bincount(row, minlength=20) for row in members]
@@ -32,14 +32,14 @@ def test_random_teams_are_k_phi_draws_from_each_population():
 
 
 def test_balanced_teams_have_everybody_equally_often():
-    balanced = CCEA(Meet(), population_size=7, elite_fraction=0.2, teams=4, teaming="balanced")
+    balanced = CCEA.ccea(Meet(), population_size=7, elite_fraction=0.2, teams=4, teaming="balanced")
     members = np.asarray(balanced.drawn(key=jax.random.key(0)))
     assert [np.bincount(row).tolist() for row in members] == [[4] * 7] * 2
     assert (members[0] != members[1]).any()
 
 
 def test_without_partners_an_individual_plays_the_simulations_of_all_its_teams():
-    alone = CCEA(ExtendedTMaze(depth=1), population_size=6, elite_fraction=0.2, teams=3)
+    alone = CCEA.ccea(ExtendedTMaze(depth=1), population_size=6, elite_fraction=0.2, teams=3)
     assert (alone.agents, alone.simulations) == (1, 3 * 7)
     np.testing.assert_array_equal(alone.drawn(key=jax.random.key(0)), [[0, 1, 2, 3, 4, 5]])
     assert SMALL.simulations == 2
@@ -51,13 +51,13 @@ def test_without_partners_an_individual_plays_the_simulations_of_all_its_teams()
 def test_fitness_is_the_mean_or_best_over_the_teams_of_a_member():
     members = jnp.array([[0, 0, 1, 1, 3], [2, 0, 2, 2, 2]])
     returns = jnp.array([[1.0, 3.0], [4.0, 4.0], [0.0, 0.0], [8.0, 6.0], [5.0, 5.0]])
-    ccea = CCEA(Meet(), population_size=4, elite_fraction=0.25)
+    ccea = CCEA.ccea(Meet(), population_size=4, elite_fraction=0.25)
     none = -np.inf  # it ranks last
     np.testing.assert_allclose(
         assigned(ccea, members, returns),
         [[3.0, 3.5, none, 5.0], [4.0, none, (2 + 0 + 7 + 5) / 4, none]],
     )
-    best = CCEA(Meet(), population_size=4, elite_fraction=0.25, assignment="best")
+    best = CCEA.ccea(Meet(), population_size=4, elite_fraction=0.25, assignment="best")
     np.testing.assert_allclose(
         assigned(best, members, returns), [[4.0, 7.0, none, 5.0], [4.0, none, 7.0, none]]
     )
@@ -66,7 +66,7 @@ def test_fitness_is_the_mean_or_best_over_the_teams_of_a_member():
 def test_of_a_private_signal_each_member_is_assigned_its_own():
     members = jnp.array([[0, 1], [1, 1]])
     returns = jnp.array([[[1.0, 10.0]], [[2.0, 30.0]]])  # [teams, episodes, agents]
-    ccea = CCEA(Meet(), population_size=2, elite_fraction=0.5)
+    ccea = CCEA.ccea(Meet(), population_size=2, elite_fraction=0.5)
     np.testing.assert_allclose(assigned(ccea, members, returns), [[1.0, 2.0], [-np.inf, 20.0]])
 
 
@@ -83,7 +83,7 @@ def test_a_generation_keeps_the_elite_of_each_population_and_joins_them():
 
 @pytest.mark.parametrize("fitness", [None, "local"])
 def test_two_populations_learn_to_meet(fitness):
-    ccea = CCEA(
+    ccea = CCEA.ccea(
         Meet(), MLP(hidden=(4,)), population_size=16, elite_fraction=0.1, teams=2, fitness=fitness
     )
     state = ccea.init(key=jax.random.key(0))
@@ -105,13 +105,13 @@ def test_two_populations_learn_to_meet(fitness):
 )
 def test_bad_settings_say_what_is_allowed(fields, told):
     with pytest.raises(ValueError, match=told):
-        CCEA(Meet(), **fields)
+        CCEA.ccea(Meet(), **fields)
 
 
 def test_islands_of_a_population_do_not_mix():
     still = MatrixMutation(probability=0.0)
     islands = Islands(2, renewal=0.0)
-    apart = dataclasses.replace(
+    apart = evolved(
         SMALL,
         population_size=8,
         elite_fraction=0.25,
@@ -130,7 +130,7 @@ def test_islands_of_a_population_do_not_mix():
 
 
 def test_the_weakest_island_of_each_population_is_settled_anew():
-    renewed = dataclasses.replace(
+    renewed = evolved(
         SMALL,
         population_size=12,
         elite_fraction=0.25,
@@ -142,7 +142,7 @@ def test_the_weakest_island_of_each_population_is_settled_anew():
     first = np.asarray(jax.tree.leaves(state.populations)[0]).reshape(2, 12, -1)
     fitness = np.tile(np.arange(12.0), (2, 1))
     fitness[1] = fitness[1, ::-1]
-    bred = jax.tree.leaves(bred_by(renewed, state.populations, fitness, key=jax.random.key(1)))[0]
+    bred = jax.tree.leaves(breed(renewed, state.populations, fitness, key=jax.random.key(1)))[0]
     old = (np.asarray(bred).reshape(2, 12, 1, -1) == first[:, None]).all(axis=3).any(axis=2)
     assert old.reshape(2, 3, 4).all(axis=2).tolist() == [[False, True, True], [True, True, False]]
     assert old.sum() == 16  # no other member is new
@@ -152,9 +152,11 @@ def test_elites_are_counted_by_island():
     with pytest.raises(
         ValueError, match=r"elite_fraction is 0.04 of 14 members of an island.*give 0.072 or"
     ):
-        CCEA(Meet(), population_size=70, islands=Islands(5))
-    assert CCEA(Meet(), population_size=70, elite_fraction=0.072, islands=Islands(5)).elites == 5
+        CCEA.ccea(Meet(), population_size=70, islands=Islands(5))
+    assert (
+        CCEA.ccea(Meet(), population_size=70, elite_fraction=0.072, islands=Islands(5)).elites == 5
+    )
     with pytest.raises(TypeError, match=r"islands is 4: give Islands\(number=4\)"):
-        CCEA(Meet(), islands=4)  # pyright: ignore[reportArgumentType]
+        CCEA.ccea(Meet(), islands=4)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="4 islands for a population of 30"):
-        CCEA(Meet(), population_size=30, islands=Islands(4))
+        CCEA.ccea(Meet(), population_size=30, islands=Islands(4))

@@ -8,15 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compilations import compilations
+from evolved import evolved
 from walk import HostWalk, Walk
 
 from credo import rollout, tree
-from credo.algorithms.erl import ERL, MUTATION, TABLE_5_1, breed
+from credo.algorithms.erl import BREEDER, ERL, TABLE_5_1
+from credo.algorithms.hybrid import bred as breed
+from credo.algorithms.lineage import CROSSED, DRAWN, INJECTED, MUTATED, Lineage
 from credo.compilation import jit
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy
 from credo.evolution.crossover import MaskedCrossover
-from credo.evolution.lineage import CROSSED, DRAWN, INJECTED, MUTATED, Lineage
 from credo.learners.manager import UCB
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3
@@ -30,7 +32,7 @@ ALGORITHM = ERL(
     MLP(hidden=(3,)),
     (LEARNER,),
     population_size=K,
-    elite_fraction=0.34,
+    breeder=dataclasses.replace(BREEDER, elite_fraction=0.34),
     sync_period=2,
     updates_per_frame=0.5,
     warmup_frames=45,
@@ -253,7 +255,8 @@ def test_elites_may_be_judged_by_all_their_episodes():
 
 FITNESS = jnp.array([3.0, 0.0, 5.0, 1.0, 4.0, 2.0])
 RANK = [2, 5, 0, 4, 1, 3]
-QUIET = dataclasses.replace(
+MUTATION = BREEDER.mutation
+QUIET = evolved(
     ALGORITHM,
     mutation=dataclasses.replace(MUTATION, probability=0.0),
     crossover=MaskedCrossover(probability=1.0),  # a crossed child is its survivor
@@ -298,7 +301,7 @@ def test_a_member_with_nan_fitness_is_never_elite_nor_selected(erl):
 
 
 def test_elites_are_never_mutated_and_others_are_when_the_gate_opens(erl):
-    always = dataclasses.replace(QUIET, mutation=dataclasses.replace(MUTATION, probability=1.0))
+    always = evolved(QUIET, mutation=dataclasses.replace(MUTATION, probability=1.0))
     changed = 0
     for seed in range(8):
         _, lineage, _, _, copies = bred(always, erl[1][0], seed)
@@ -310,9 +313,7 @@ def test_elites_are_never_mutated_and_others_are_when_the_gate_opens(erl):
 
 
 def test_crossing_takes_rows_of_an_elite(erl):
-    crossing = dataclasses.replace(
-        QUIET, crossover=MaskedCrossover(probability=0.0), crossover_probability=1.0
-    )
+    crossing = evolved(QUIET, crossover=MaskedCrossover(probability=0.0), crossover_probability=1.0)
     _, lineage, _, _, copies = bred(crossing, erl[1][0], 0)
     assert set(copies) == {2, 4}  # nothing of the survivor is left
     assert lineage.maker.tolist() == [DRAWN] * E + [CROSSED] * (K - E)
@@ -367,12 +368,12 @@ def test_each_learner_has_a_slot_of_its_own_and_no_elites(cerl):
 
 def test_there_must_be_room_for_elites_and_for_every_learners_actor():
     with pytest.raises(ValueError, match=r"elite_fraction is 0\.7 of 6.*leave 3 for offspring"):
-        dataclasses.replace(CERL, elite_fraction=0.7)
-    assert dataclasses.replace(CERL, elite_fraction=0.5).elites == 3
+        evolved(CERL, elite_fraction=0.7)
+    assert evolved(CERL, elite_fraction=0.5).elites == 3
     with pytest.raises(ValueError, match="at least 1"):
-        dataclasses.replace(CERL, elite_fraction=0.1)
+        evolved(CERL, elite_fraction=0.1)
     with pytest.raises(ValueError, match="leave 1 for offspring"):
-        dataclasses.replace(ALGORITHM, elite_fraction=1.0)
+        evolved(ALGORITHM, elite_fraction=1.0)
 
 
 def test_workers_go_in_turn_at_first_and_always_are_as_many(cerl):
@@ -487,7 +488,11 @@ def test_inside_jax_too_nothing_compiles_after_the_first_generation_that_learns(
 def test_erl_has_its_tasks_column_of_table_5_1(task):
     ψ, ξ, ω = TABLE_5_1[task]
     algorithm = ERL.erl(Gymnasium(f"{task}-v5"))
-    assert (algorithm.elite_fraction, algorithm.episodes, algorithm.sync_period) == (ψ, ξ, ω)
+    assert (algorithm.breeder.elite_fraction, algorithm.episodes, algorithm.sync_period) == (
+        ψ,
+        ξ,
+        ω,
+    )
     assert algorithm.elites == round(10 * ψ)
     assert (algorithm.population_size, algorithm.test_episodes) == (10, 5)
 
@@ -497,9 +502,9 @@ def test_presets_and_what_they_share():
     assert set(presets) == {"erl", "ours", "ea", "cerl"}
     erl, ea, cerl = presets["erl"], presets["ea"], presets["cerl"]
     assert dataclasses.replace(erl, learners=()) == ea
-    assert (erl.elite_fraction, erl.episodes, erl.sync_period) == (0.1, 1, 10)
+    assert (erl.breeder.elite_fraction, erl.episodes, erl.sync_period) == (0.1, 1, 10)
     assert (erl.learners[0].actor_lr, erl.learners[0].critic_lr) == (5e-5, 5e-4)
-    mutation = erl.mutation
+    mutation = erl.breeder.mutation
     assert (mutation.probability, mutation.fraction, mutation.strength) == (0.9, 0.1, 0.1)
     assert (mutation.super_probability, mutation.reset_probability) == (0.05, 0.05)
     assert (mutation.vectors, mutation.limit) == (False, 1e6)
@@ -523,4 +528,4 @@ def test_presets_and_what_they_share():
 )
 def test_impossible_settings_are_refused(fields, told):
     with pytest.raises(ValueError, match=told):
-        dataclasses.replace(ALGORITHM, **fields)
+        evolved(ALGORITHM, **fields)

@@ -8,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compilations import compilations
+from evolved import evolved
 
 from credo import rollout, tree
 from credo.algorithms.erl import ERL
-from credo.algorithms.merl import LOCAL, MERL
+from credo.algorithms.lineage import DRAWN, INJECTED
+from credo.algorithms.merl import BREEDER, LOCAL, MERL
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.algorithms.off_policy import OffPolicy
 from credo.algorithms.ppo import PPO
 from credo.compilation import jit
 from credo.environments.probes import Copy, Meet
-from credo.evolution.lineage import DRAWN, INJECTED
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3, matd3
 from credo.networks.exploration import GaussianNoise
@@ -37,7 +38,7 @@ ALGORITHM = MERL(
     NETWORK,
     (LEARNER,),
     population_size=K,
-    elite_fraction=0.4,
+    breeder=dataclasses.replace(BREEDER, elite_fraction=0.4),
     episodes=EPISODES,
     workers=WORKERS,
     migration_period=2,
@@ -89,7 +90,7 @@ def played_by(algorithm, state, generation):
 
 def fitness_of(algorithm, state, generation):
     """The team's reward; of a private one the mean over agents."""
-    returns = np.asarray(played_by(algorithm, state, generation).returns[algorithm.signal])
+    returns = np.asarray(played_by(algorithm, state, generation).returns[algorithm.reward])
     return returns.reshape(K, -1).mean(axis=1)
 
 
@@ -114,7 +115,7 @@ def test_a_start_is_a_population_of_teams_a_team_that_learns_and_an_empty_buffer
 
 def test_fitness_is_the_reward_of_all_and_elites_come_first(merl):
     rows, states = merl
-    assert (ALGORITHM.signal, ALGORITHM.elites) == ("global", E)
+    assert (ALGORITHM.reward, ALGORITHM.elites) == ("global", E)
     assert len({row["fitness_mean"] for row in rows}) > 2
     for g, row in enumerate(rows, start=1):
         before, after = states[g - 1], states[g]
@@ -235,7 +236,7 @@ def test_without_learners_it_is_evolution_alone(merl):
     assert [row["episodes"] for row in rows] == [10, 20, 30]
     assert states[-1].lineage.share.tolist() == [[1.0]] * K
     assert "critic_loss_0" not in rows[0]
-    shared = ("population_size", "elite_fraction", "episodes", "crossover_probability")
+    shared = ("population_size", "breeder", "episodes")
     ea = ERL.ea(
         Meet(),
         NETWORK,
@@ -243,7 +244,7 @@ def test_without_learners_it_is_evolution_alone(merl):
         test_every=2,
         **{name: getattr(alone, name) for name in shared},
     )
-    assert ea.mutation == alone.mutation
+    assert ea.breeder == alone.breeder
     assert same(ea.init(key=key_of(0)).population, states[0].population)
     for g, row in enumerate(rows, start=1):
         assert row["frames"] == int(jnp.sum(played_by(alone, states[g - 1], g).steps))
@@ -487,7 +488,7 @@ def test_recurrent_teams_can_be_evolved_only():
 )
 def test_impossible_settings_are_refused(fields, told):
     with pytest.raises(ValueError, match=told):
-        dataclasses.replace(ALGORITHM, **fields)
+        evolved(ALGORITHM, **fields)
 
 
 def test_the_preset_is_that_of_the_rover_domain():

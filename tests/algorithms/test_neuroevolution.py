@@ -9,15 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from evolved import evolved
 
 from credo import rollout, tree
 from credo.algorithms.neuroevolution import Neuroevolution, breed
+from credo.environments.curriculum import Curriculum
 from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.server_fleet import ServerFleet
 from credo.evolution.agents import AgentCrossover
 from credo.evolution.crossover import MaskedCrossover, NoCrossover, OnePointCrossover
-from credo.evolution.curriculum import Curriculum
+from credo.evolution.extinction import Extinction
 from credo.evolution.mutation import MatrixMutation
 from credo.networks.dmmu import DMMU
 from credo.networks.mlp import MLP
@@ -25,7 +27,7 @@ from credo.networks.mmu import MMU
 from credo.networks.team import Centralized
 
 TASK = SequenceClassification(depth=3, min_gap=1, max_gap=2)
-ALGORITHM = Neuroevolution(
+ALGORITHM = Neuroevolution.as_written(
     TASK, MMU(hidden=3), population_size=20, elite_fraction=0.2, episodes=4, test_episodes=8
 )
 KEY = jax.random.key(0)
@@ -112,7 +114,7 @@ def test_the_same_seed_gives_the_same_weights(start, after):
     assert not same(other, after[0])
 
 
-QUIET = dataclasses.replace(ALGORITHM, mutation=MatrixMutation(probability=0.0))
+QUIET = evolved(ALGORITHM, mutation=MatrixMutation(probability=0.0))
 
 
 def ancestors(bred, start):
@@ -123,7 +125,7 @@ def ancestors(bred, start):
 
 def test_offspring_come_from_the_selected(start):
     """With mutation off every offspring is a member, the fitter the more often."""
-    parents = ancestors(breed(QUIET, start.population, jnp.arange(20.0), key=KEY), start)
+    parents = ancestors(breed(QUIET, start, jnp.arange(20.0), key=KEY)[0], start)
     assert parents[:4] == [19, 18, 17, 16]
     assert np.mean(parents[4:]) > 12  # the best of three of 0..19: 14.7 on average
 
@@ -138,8 +140,8 @@ def row_parents(child, population):
 
 
 def test_crossover_mixes_an_elite_into_the_selected(start):
-    crossing = dataclasses.replace(QUIET, crossover_probability=1.0)
-    bred = breed(crossing, start.population, jnp.arange(20.0), key=KEY)
+    crossing = evolved(QUIET, crossover_probability=1.0)
+    bred = breed(crossing, start, jnp.arange(20.0), key=KEY)[0]
     mixed = 0
     for i in range(4, 20):
         parents = list(row_parents(tree.take(bred, i), start.population))
@@ -153,24 +155,24 @@ def test_crossover_mixes_an_elite_into_the_selected(start):
 
 def test_as_coded_is_the_authors_program_and_can_be_overridden():
     coded = Neuroevolution.as_coded(TASK, MMU(hidden=3))
-    assert coded.cross_repeated
+    assert coded.breeder.cross_repeated
     assert (coded.population_size, coded.elites, coded.episodes) == (100, 10, 10)
-    mutation = coded.mutation
+    mutation = coded.breeder.mutation
     assert isinstance(mutation, MatrixMutation)
     assert (mutation.gate, mutation.probability) == ("genome", 0.9)
     assert (mutation.fraction, mutation.up_to_fraction, mutation.strength) == (0.2, True, 0.2)
     assert (mutation.super_probability, mutation.super_strength) == (0.05, 10.0)
-    assert coded.selection.size == 3
+    assert coded.breeder.selection.size == 3
     assert (coded.elite_memory, coded.curriculum, coded.fitness) == (1, None, ())
     smaller = Neuroevolution.as_coded(TASK, MMU(hidden=3), population_size=10, cross_repeated=False)
-    assert (smaller.population_size, smaller.cross_repeated) == (10, False)
+    assert (smaller.population_size, smaller.breeder.cross_repeated) == (10, False)
 
 
 def test_repeated_survivors_are_crossed(start):
     fitness = jnp.arange(20.0)
-    parents = ancestors(breed(QUIET, start.population, fitness, key=KEY), start)
-    crossing = dataclasses.replace(QUIET, cross_repeated=True)
-    bred = breed(crossing, start.population, fitness, key=KEY)
+    parents = ancestors(breed(QUIET, start, fitness, key=KEY)[0], start)
+    crossing = evolved(QUIET, cross_repeated=True)
+    bred = breed(crossing, start, fitness, key=KEY)[0]
     changed = 0
     for i in range(4, 20):
         child, parent = tree.take(bred, i), tree.take(start.population, parents[i])
@@ -185,9 +187,9 @@ def test_repeated_survivors_are_crossed(start):
 def test_offspring_mate_with_each_other_behind_mutation(start):
     """Algorithm 5, lines 15-23: both parents are of S, one of them the offspring itself."""
     fitness = jnp.arange(20.0)
-    alone = ancestors(breed(QUIET, start.population, fitness, key=KEY), start)
-    mating = dataclasses.replace(QUIET, mating=(MaskedCrossover(part="matrix"),))
-    bred = breed(mating, start.population, fitness, key=KEY)
+    alone = ancestors(breed(QUIET, start, fitness, key=KEY)[0], start)
+    mating = evolved(QUIET, mating=(MaskedCrossover(part="matrix"),))
+    bred = breed(mating, start, fitness, key=KEY)[0]
     assert all(same(tree.take(bred, i), tree.take(start.population, alone[i])) for i in range(4))
     mates = set()
     for i in range(4, 20):
@@ -203,21 +205,18 @@ def test_offspring_mate_with_each_other_behind_mutation(start):
 def test_algorithm_5_as_a_preset():
     fleet = ServerFleet(servers=2, devices=3, nefarious=1)
     team = Neuroevolution.dmmu(fleet, DMMU(hidden=3))
-    assert team.mating == (OnePointCrossover(0.05), AgentCrossover(0.05))
+    assert team.breeder.mating == (OnePointCrossover(0.05), AgentCrossover(0.05))
     assert (team.population_size, team.elites, team.episodes, team.test_episodes) == (
         100,
         4,
         10,
         10,
     )
-    assert (team.extinction.probability, team.extinction.magnitude) == (0.004, 0.5)
-    assert (team.mutation.gate, team.mutation.probability, team.mutation.strength) == (
-        "matrix",
-        0.9,
-        0.1,
-    )
+    extinction, mutation = team.breeder.extinction, team.breeder.mutation
+    assert (extinction.probability, extinction.magnitude) == (0.004, 0.5)
+    assert (mutation.gate, mutation.probability, mutation.strength) == ("matrix", 0.9, 0.1)
     central = Neuroevolution.dmmu(fleet, Centralized(MLP(hidden=(3,))), population_size=30)
-    assert central.mating == (OnePointCrossover(0.05),)
+    assert central.breeder.mating == (OnePointCrossover(0.05),)
     assert central.population_size == 30
 
 
@@ -225,7 +224,7 @@ def test_a_fleet_learns_by_algorithm_5():
     """One of two devices is nefarious: who sticks to one earns 0 on average."""
     fleet = ServerFleet(servers=2, devices=2, requests=3, nefarious=1, max_steps=5)
     team = Neuroevolution.dmmu(fleet, DMMU(hidden=3), population_size=30, episodes=20)
-    team = dataclasses.replace(team, elite_fraction=0.1, test_episodes=100)
+    team = evolved(team, elite_fraction=0.1, test_episodes=100)
     state, key = team.init(key=KEY), jax.random.key(1)
     for g in range(30):
         state, metrics = team.generation(state, key=jax.random.fold_in(key, g))
@@ -233,11 +232,8 @@ def test_a_fleet_learns_by_algorithm_5():
 
 
 def test_extinction_spares_the_elites(start):
-    doomed = dataclasses.replace(
-        ALGORITHM,
-        extinction=dataclasses.replace(ALGORITHM.extinction, probability=1.0, magnitude=1.0),
-    )
-    bred = breed(doomed, start.population, jnp.arange(20.0), key=KEY)
+    doomed = evolved(ALGORITHM, extinction=Extinction(probability=1.0, magnitude=1.0))
+    bred = breed(doomed, start, jnp.arange(20.0), key=KEY)[0]
     assert all(same(tree.take(bred, i), tree.take(start.population, 19 - i)) for i in range(4))
     # The others are fresh: their weights are standard normal again, whoever was selected.
     fresh = np.asarray(bred.N_i[4:])
@@ -275,17 +271,18 @@ def test_nothing_compiles_after_the_first_generation(start):
 
 
 def test_a_new_hyper_parameter_compiles_nothing(start):
-    state, _ = ALGORITHM.generation(start, key=jax.random.key(6))
-    stronger = dataclasses.replace(
-        ALGORITHM,
+    algorithm = evolved(ALGORITHM, extinction=Extinction(probability=0.0))
+    state, _ = algorithm.generation(start, key=jax.random.key(6))
+    stronger = evolved(
+        algorithm,
         mutation=MatrixMutation(strength=0.5, fraction=0.3),
         crossover_probability=0.1,
-        extinction=dataclasses.replace(ALGORITHM.extinction, probability=0.01),
+        extinction=Extinction(probability=0.01),
     )
     with compilations() as events:
         changed, _ = jax.block_until_ready(stronger.generation(state, key=jax.random.key(7)))
     assert events == []
-    plain, _ = ALGORITHM.generation(state, key=jax.random.key(7))
+    plain, _ = algorithm.generation(state, key=jax.random.key(7))
     assert not same(changed.population, plain.population)  # and it has an effect
 
 
@@ -435,13 +432,13 @@ def test_a_curriculum_may_train_on_a_longer_task_and_tests_on_the_algorithms_own
         ({"fitness": ("reward", "speed")}, "no reward signal 'speed'"),
         ({"fitness": "speed"}, "no reward signal 'speed': this task has reward"),
         ({"score": "speed"}, "no reward signal 'speed'"),
-        ({"crossover": NoCrossover(), "cross_repeated": True}, "nobody would be crossed"),
+        ({"crossover": NoCrossover(), "cross_repeated": True}, "nothing would be crossed"),
         ({"mating": (AgentCrossover(),)}, "agents of MMU have no weights of their own"),
     ],
 )
 def test_impossible_settings_are_refused(fields, told):
     with pytest.raises(ValueError, match=told):
-        Neuroevolution(Copy(), MMU(hidden=2), **fields)
+        Neuroevolution.as_written(Copy(), MMU(hidden=2), **fields)
 
 
 def test_large_genomes_are_bred_in_batches_as_they_are_together(monkeypatch):
@@ -454,12 +451,12 @@ def test_large_genomes_are_bred_in_batches_as_they_are_together(monkeypatch):
         crossover_probability=0.5,
         mating=(OnePointCrossover(probability=0.5), AgentCrossover(probability=0.5)),
     )
-    population, fitness = fleet.new_population(key=KEY), jnp.arange(8.0)
+    state, fitness = fleet.init(key=KEY), jnp.arange(8.0)
     # Compiled under other names: what fits into a cache is read while a program is made.
-    together = eqx.filter_jit(lambda p: breed(fleet, p, fitness, key=KEY))(population)
-    weights = sum(x[0].size for x in jax.tree.leaves(population))
+    together = eqx.filter_jit(lambda s: breed(fleet, s, fitness, key=KEY)[0])(state)
+    weights = sum(x[0].size for x in jax.tree.leaves(state.population))
     monkeypatch.setattr(tree, "CACHED", 3 * weights)
-    assert tree.batch(population) == 3
-    apart = eqx.filter_jit(lambda p: breed(fleet, p, fitness, key=KEY))(population)
+    assert tree.batch(state.population) == 3
+    apart = eqx.filter_jit(lambda s: breed(fleet, s, fitness, key=KEY)[0])(state)
     for a, b in zip(jax.tree.leaves(apart), jax.tree.leaves(together), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from credo.algorithms.lineage import INJECTED, MAKERS, MUTATED
 from credo.analysis import attribution
-from credo.evolution.lineage import INJECTED, MAKERS, MUTATED
 
 TWO = {  # two learners, four generations
     "generation": np.arange(1.0, 5.0),

@@ -17,8 +17,10 @@ from credo.analysis.fleet import (
     play_fleet,
     play_oracle,
     starts,
+    trace_fleet,
 )
 from credo.environments.server_fleet import ServerFleet
+from credo.networks.dmmu import DMMU
 
 KEY = jax.random.key(0)
 CASE = ServerFleet.case_study()
@@ -176,3 +178,23 @@ def test_what_cannot_be_done_is_told():
         best_discovery(ServerFleet())
     with pytest.raises(ValueError, match="the same in every episode"):
         best_discovery(ServerFleet.case_study((True, True, False, False)))
+
+
+@pytest.mark.parametrize("order", ["sequential", "random"])
+def test_a_trace_says_who_served_what_and_who_wrote(order):
+    policy = DMMU(hidden=3, order=order).init(*CASE.sizes, key=KEY)
+    genuine = np.array([True, False, True, False])
+    trace = trace_fleet(CASE, policy, genuine, key=KEY)
+    left, net = [CASE.requests] * 4, np.zeros(CASE.max_steps)
+    for t in range(CASE.max_steps):
+        for server in np.flatnonzero(trace.acting[t]):
+            device = int(trace.device[t, server])
+            if left[device] > 0:
+                left[device] -= 1
+                net[t] += 1 if genuine[device] else -1
+    np.testing.assert_array_equal(trace.net, net)
+    assert trace.acting.any()
+    written = np.asarray(trace.writes).sum(axis=1).cumsum(axis=0)
+    start = np.asarray(policy.start(key=KEY).memory)
+    np.testing.assert_allclose(trace.memory, start[None] + written, rtol=1e-4, atol=1e-4)
+    assert sorted(trace.signature.tolist()) == [0, 1, 2]

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -147,6 +148,38 @@ def test_a_job_stopped_half_way_goes_on(trained, tmp_path):
     local.run([job])
     assert job.finished()
     assert (path / "metrics.csv").read_bytes() == (first.path / "metrics.csv").read_bytes()
+
+
+def test_what_the_clock_left_is_named_with_how_to_go_on(tmp_path, capsys):
+    options = FIVE.changed({"generations": 10**6, "wall_clock": 0.0})
+    jobs = [local.Job(tmp_path / f"seed-{seed}", ALGORITHM, seed, options) for seed in range(2)]
+    local.run(jobs, workers=1)
+    assert (
+        "credo: 2 of 2 runs are not finished for want of time (seed-0 generation 1/1000000, seed-1 "
+        f"generation 1/1000000): go on with `credo resume {tmp_path}`"
+    ) in capsys.readouterr().err
+
+
+def test_runs_go_on_with_another_setting_and_a_larger_budget(trained, tmp_path):
+    (first, _, second), _ = trained
+    paths = [shutil.copytree(job.path, tmp_path / job.path.name) for job in (first, second)]
+    options = RunOptions(generations=7, tensorboard=False)
+    again = {"set": {"crossover_probability": 0.5}}
+    local.run([local.Job.resumed(path, options, **again) for path in paths])
+    for path in paths:
+        run = loop.Run(path)
+        assert run.metrics["generation"][-1] == 7
+        assert run.algorithm == dataclasses.replace(ALGORITHM, crossover_probability=0.5)
+        assert run.config["changes"][0]["set"] == {"crossover_probability": 0.5}
+    local.run([local.Job.resumed(path, RunOptions()) for path in paths])  # nothing to do
+    with pytest.raises(loop.RunError, match=f"{paths[0]}: this run's budget is 7 generations: a n"):
+        local.Job.resumed(paths[0], RunOptions(generations=3)).finished()
+
+
+def test_callbacks_stay_here(tmp_path):
+    options = RunOptions(callbacks=(print,))
+    with pytest.raises(ValueError, match="callbacks stay in this process"):
+        local.Job(tmp_path, ALGORITHM, 0, options)
 
 
 def test_a_signal_reaches_every_worker_and_each_saves(tmp_path):

@@ -1,79 +1,37 @@
+"""Pages: well formed, self-contained, safe whatever a label holds; and their Markdown."""
+
+import json
 import re
 import subprocess
 import sys
 from collections import Counter
 from html.parser import HTMLParser
 
-import matplotlib
 import numpy as np
 import pytest
+from samples import HOSTILE, figure, heat_map, tracks
 
-from credo.analysis.statistics import bootstrap_interval
-from credo.report import plots
-from credo.report.page import (
+from credo.report import statistics
+from credo.report.pages import groups, markdown, markdown_text, render, shown, write
+from credo.report.sections import (
+    SMOKE,
     Curve,
+    Drawing,
     Figure,
-    HeatMap,
     Page,
     Reference,
+    Summary,
     Table,
     Text,
     Track,
-    Tracks,
-    write,
 )
-from credo.report.page import cell_text as shown
-
-HOSTILE = '<script>alert(\'x\')</script> & "$a_$" id="f"'
-
-
-def figure(**changes) -> Figure:
-    rng = np.random.default_rng(0)
-    curves = [Curve(f"depth {d}", np.arange(30), rng.random((4, 30))) for d in (2, 3)]
-    arguments = {
-        "title": "Success",
-        "x_label": "generation",
-        "y_label": "share",
-        "curves": curves,
-        "references": (Reference("floor", 0.25), Reference("ceiling", 1.0)),
-    }
-    return Figure(**(arguments | changes))
-
-
-def heat_map(**changes) -> HeatMap:
-    arguments = {
-        "title": "Writes",
-        "values": np.linspace(-1.0, 2.0, 15).reshape(3, 5),
-        "row_labels": ["a", "b", "c"],
-        "column_labels": list("12345"),
-        "x_label": "step",
-        "y_label": "cell",
-    }
-    return HeatMap(**(arguments | changes))
-
-
-def tracks(**changes) -> Tracks:
-    arguments = {
-        "title": "Walk",
-        "tracks": [
-            Track("robot", [0, 1, 1, 2], ["", "told", "", ""]),
-            Track("static", [0] * 4, (), True),
-        ],
-        "goals": [0, 2, 1, 1],
-        "reached": [True, False, True, False],
-        "row_labels": ["a", "b", "c"],
-        "column_labels": list("1234"),
-        "x_label": "trial",
-        "y_label": "endpoint",
-        "breaks": (2,),
-    }
-    return Tracks(**(arguments | changes))
+from credo.report.styles import STATIC
 
 
 class Reader(HTMLParser):
     """Tags, attributes and text; fails on a tag that is not closed."""
 
-    VOID = {"meta", "link", "wbr"}
+    VOID = {"meta", "link", "br"}
 
     def __init__(self, html: str):
         super().__init__()
@@ -98,12 +56,12 @@ class Reader(HTMLParser):
         self.text.append(data)
 
 
-@pytest.fixture(scope="module")
-def html(tmp_path_factory) -> str:
+def full_page() -> Page:
     """A page with everything on it, the same figure twice, and a hostile string everywhere."""
     bad_curve = Curve(HOSTILE, [1, 10, 100], [[0.0, 1.0, np.nan]])
     bad = Figure(HOSTILE, HOSTILE, HOSTILE, [bad_curve], [Reference(HOSTILE, 0.5)], HOSTILE, True)
-    page = Page(
+    runs = Summary([0.25, 0.5, None], [0, 1, 2])
+    return Page(
         HOSTILE,
         HOSTILE,
         f"credo reproduce fig-3.4a {HOSTILE}",
@@ -111,28 +69,35 @@ def html(tmp_path_factory) -> str:
             Text(HOSTILE, [HOSTILE, "two"]),
             figure(),
             figure(),
-            heat_map(row_labels=[HOSTILE, "b", "c"]),
+            heat_map(row_labels=[HOSTILE, "b", "c"], x_label=HOSTILE),
             Table(HOSTILE, [HOSTILE, "n"], [(HOSTILE, 1.5), ("0.50", None)], HOSTILE),
+            Table(HOSTILE, [HOSTILE, "n"], [(HOSTILE, runs)], HOSTILE, [0], True),
             bad,
             tracks(tracks=[Track(HOSTILE, [0, 1, 2, 2], [HOSTILE] * 4)], goal_label=HOSTILE),
         ],
-        {HOSTILE: HOSTILE},
+        {HOSTILE: HOSTILE, "several": [HOSTILE, "two"]},
+        HOSTILE,
     )
-    path = write(page, tmp_path_factory.mktemp("page") / "new" / "report.html")
+
+
+@pytest.fixture(scope="module")
+def html(tmp_path_factory) -> str:
+    path = write(full_page(), tmp_path_factory.mktemp("page") / "new" / "report.html")
     assert [child.name for child in path.parent.iterdir()] == ["report.html"]
     return path.read_text(encoding="utf-8")
 
 
 def test_page_is_well_formed_and_has_its_sections(html):
     page = Reader(html)
-    assert page.tags["svg"] == 2 * 5
-    assert page.tags["table"] == 2
-    assert page.tags["title"] == page.tags["h1"] == page.tags["details"] == 1
+    assert page.tags["svg"] == 2 * 5 + 5  # of the legends one for each curve
+    assert page.tags["table"] == 4  # with that of tracks, and provenance
+    assert page.tags["title"] == page.tags["h1"] == 1
+    assert page.tags["details"] == 2
     assert ("lang", "en") in page.attributes
     assert ("name", "viewport") in page.attributes
     labels = [value for name, value in page.attributes if name == "aria-label"]
     expected = "Success: share against generation; curves: depth 2, depth 3; "
-    assert labels.count(f"{expected}references: floor at 0.25, ceiling at 1") == 4
+    assert labels.count(f"{expected}references: baseline at 0.25, upper bound at 1") == 4
 
 
 def test_page_loads_nothing_from_anywhere(html):
@@ -146,208 +111,28 @@ def test_page_loads_nothing_from_anywhere(html):
 
 def test_whatever_a_label_holds_is_shown_and_never_run(html):
     page = Reader(html)
-    assert page.tags["script"] == 0
-    # Title, heading, lead; text twice; table five times; figure title and caption; two facts.
-    assert sum(HOSTILE in text for text in page.text) >= 12
+    assert page.tags["script"] == 1
+    (script,) = re.findall(r"<script>(.*?)</script>", html, flags=re.S)
+    assert script == (STATIC / "page.js").read_text(encoding="utf-8")
+    handlers = [name for name, _ in page.attributes if name.startswith("on")]
+    assert handlers == []
+    # Banner, title, heading, lead, text, tables, captions, facts.
+    assert sum(HOSTILE in text for text in page.text) >= 16
     assert "".join(page.text).count(f"credo reproduce fig-3.4a {HOSTILE}") == 1
+    tips = [value for name, value in page.attributes if name == "data-tips"]
+    assert len(tips) == 4
+    assert json.loads(tips[2])["rows"][0] == f"cell {HOSTILE}"
 
 
 def test_ids_differ_and_every_reference_stays_in_its_figure(html):
-    drawings = re.findall(r"<svg.*?</svg>", html, flags=re.S)
+    drawings = re.findall(r"<svg xmlns.*?</svg>", html, flags=re.S)
+    assert len(drawings) == 10
     found = [set(re.findall(r'<[^>]* id="([^"]+)"', drawing)) for drawing in drawings]
     assert sum(map(len, found)) == len(set().union(*found))
     for drawing, ids in zip(drawings, found, strict=True):
         used = set(re.findall(r'(?:url\(#|href="#)([^")]+)', drawing))
         assert used
         assert used <= ids
-
-
-def test_text_of_a_figure_is_text_in_a_generic_font():
-    svg = plots.figure_svg(figure())
-    texts = re.findall(r"<text[^>]*>([^<]*)</text>", svg)
-    assert {"generation", "share", "depth 2", "depth 3", "floor", "ceiling"} <= set(texts)
-    families = set(re.findall(r"font-family: ([^;\"]+)", svg))
-    assert families == {plots.FONT}
-    assert "<style" not in svg
-
-
-def test_dark_and_light_differ_in_colour_alone():
-    def without_colour(svg: str) -> str:
-        # The id of a marker is a hash of its path and its colour.
-        return re.sub(r"#[0-9a-f]{6}\b|\bm[0-9a-f]{10}\b", "", svg)
-
-    light, dark = plots.figure_svg(figure()), plots.figure_svg(figure(), dark=True)
-    assert light != dark
-    assert without_colour(light) == without_colour(dark)
-    assert light == plots.figure_svg(figure())
-    assert plots.figure_svg(heat_map()) != plots.figure_svg(heat_map(), dark=True)
-
-
-def drawn(item, dark=False):
-    with matplotlib.rc_context(plots.STYLE):
-        canvas = plots.draw(item, plots.DARK if dark else plots.LIGHT)
-        canvas.draw_without_rendering()
-    return canvas
-
-
-@pytest.mark.parametrize("centre", ["mean", "median"])
-def test_figure_draws_every_seed_the_centre_and_its_interval(centre):
-    runs = np.random.default_rng(1).random((5, 12))
-    axes = drawn(figure(curves=[Curve("a", np.arange(12), runs)], centre=centre)).axes[0]
-    *seeds, thick, floor, ceiling = [line.get_ydata() for line in axes.lines]
-    np.testing.assert_array_equal(seeds, runs)
-    statistic = getattr(np, centre)
-    np.testing.assert_array_equal(thick, statistic(runs, axis=0))
-    assert set(floor) == {0.25}
-    assert set(ceiling) == {1.0}
-    low, high = bootstrap_interval(runs, statistic)
-    band = axes.collections[0].get_paths()[0].vertices
-    for x in range(12):
-        assert {low[x], high[x]} == set(band[band[:, 0] == x, 1])
-
-
-def test_a_curve_ends_where_a_seed_has_no_value():
-    runs = np.ones((2, 4))
-    runs[1, 2:] = np.nan, np.inf
-    curve = plots.sampled(Curve("a", np.arange(4), runs), "mean", False, 400)
-    assert np.isnan(curve.centre).tolist() == [False, False, True, True]
-    assert np.isnan(curve.low).tolist() == [False, False, True, True]
-    assert curve.runs[0].tolist() == [1.0] * 4
-
-
-@pytest.mark.parametrize("log_x", [False, True])
-def test_long_curves_are_picked_from_and_not_smoothed(log_x):
-    x = np.arange(1.0, 15_001.0)
-    runs = np.random.default_rng(2).random((2, 15_000))
-    curve = plots.sampled(Curve("a", x, runs), "mean", log_x, 400)
-    assert 200 < len(curve.x) <= 400
-    assert (curve.x[0], curve.x[-1]) == (1.0, 15_000.0)
-    np.testing.assert_array_equal(curve.runs, runs[:, curve.x.astype(int) - 1])
-    gaps = np.diff(np.log(curve.x[-100:]) if log_x else curve.x)
-    assert gaps.max() < 1.1 * gaps.min()
-
-
-def test_note_says_what_is_drawn():
-    long = Curve("a", np.arange(15_000), np.zeros((60, 15_000)))
-    expected = "Thick: median of 60 seeds; thin: each seed; band: 95 % bootstrap interval of the "
-    assert plots.note(figure(curves=[long, long], centre="median")) == (
-        f"{expected}median. Up to 200 of 15,000 points are drawn, unsmoothed."
-    )
-    assert plots.note(figure(curves=[Curve("a", [0, 1], [[0, 1]])])) == "One seed per line."
-    assert plots.note(heat_map(values=np.full((3, 5), np.nan))) == "Grey: no value."
-
-
-CROWDED = figure(
-    x_label="a long name of an axis, with its unit and what else there is to be said about it",
-    y_label="a long name of an axis, with its unit in parentheses",
-    curves=[
-        Curve(f"a curve with a long name, number {i}", np.arange(50), np.ones((2, 50)) * i)
-        for i in range(11)
-    ],
-    references=[Reference(f"a level with a long name {i}", 5 + 0.01 * i) for i in range(5)],
-)
-
-
-@pytest.mark.parametrize("item", [figure(), CROWDED], ids=["plain", "crowded"])
-def test_nothing_overlaps_and_nothing_is_cut(item):
-    canvas = drawn(item)
-    axes, legend = canvas.axes[0], canvas.legends[0]
-    plot, page = axes.get_window_extent(), canvas.bbox
-    # Of a name alone: an annotation's own extent includes its leader line.
-    names = [matplotlib.text.Text.get_window_extent(label) for label in axes.texts]
-    boxes = [plot, legend.get_window_extent(), axes.xaxis.label.get_window_extent()]
-    boxes += [axes.yaxis.label.get_window_extent(), *names]
-    for i, box in enumerate(boxes):
-        assert box.x0 >= -0.5
-        assert box.y0 >= -0.5
-        assert box.x1 <= page.x1 + 0.5
-        assert box.y1 <= page.y1 + 0.5
-        for other in boxes[:i]:
-            assert not box.padded(-0.5).overlaps(other)
-    assert plot.height > 120
-    assert plot.width > 200
-
-
-def test_labels_move_no_further_than_they_must():
-    assert plots.spread_out([0.2, 0.5], [0.1, 0.1]) == [0.2, 0.5]
-    np.testing.assert_allclose(plots.spread_out([0.5, 0.5], [0.1, 0.3]), [0.5, 0.7])
-    np.testing.assert_allclose(plots.spread_out([0.98, 1.0], [0.1, 0.1]), [0.85, 0.95])
-
-
-@pytest.mark.parametrize(
-    ("last", "labels"), [(1e6, ["1", "100", "10k", "1M"]), (100.0, ["1", "2", "5", "10", "100"])]
-)
-def test_a_logarithmic_axis_has_labels_over_any_range(last, labels):
-    x = np.geomspace(1, last, 9)
-    item = figure(curves=[Curve("", x, x[None])], log_x=True, references=())
-    canvas = drawn(item)
-    assert canvas.legends == []
-    assert set(labels) <= {label.get_text() for label in canvas.axes[0].get_xticklabels()}
-
-
-def test_given_range_is_widened_for_the_references():
-    low, high = drawn(figure(y_range=(0.5, 0.9))).axes[0].get_ylim()
-    assert (low, high) == pytest.approx((0.25 - 0.0225, 1.0 + 0.0225))
-
-
-def test_heat_map_of_both_signs_is_centred_on_the_colour_of_the_page():
-    values = np.array([[-1.0, 0.0, 4.0]])
-    for theme in (plots.LIGHT, plots.DARK):
-        colors, low, high = plots.color_scale(values, theme)
-        assert (low, high) == (-4.0, 4.0)
-        middle = np.array(colors(0.5)[:3]) * 255
-        expected = [int(theme.page[i : i + 2], 16) for i in (1, 3, 5)]
-        np.testing.assert_allclose(middle, expected, atol=2)
-    assert plots.color_scale(np.array([[1.0, 3.0]]), plots.LIGHT)[1:] == (1.0, 3.0)
-    assert plots.color_scale(np.array([[2.0, np.nan]]), plots.LIGHT)[1:] == (1.5, 2.5)
-
-
-@pytest.mark.parametrize(
-    ("columns", "label", "ticks", "rotation"),
-    [(60, "{}", 12, 0.0), (8, "{}", 8, 0.0), (10, "learner {}", 10, 90.0), (3, "+ + −", 3, 0.0)],
-)
-def test_column_labels_are_all_shown_turned_or_thinned(columns, label, ticks, rotation):
-    labels = [label.format(i) for i in range(columns)]
-    item = heat_map(values=np.zeros((3, columns)), column_labels=labels)
-    shown_labels = drawn(item).axes[0].get_xticklabels()
-    assert len(shown_labels) == ticks
-    assert shown_labels[1].get_text() == labels[columns // ticks]
-    assert {text.get_rotation() for text in shown_labels} == {rotation}
-
-
-@pytest.mark.parametrize("dark", [False, True])
-def test_tracks_mark_everybody_the_goals_and_the_breaks(dark):
-    theme = plots.DARK if dark else plots.LIGHT
-    axes = drawn(tracks(), dark).axes[0]
-    line, *lines = axes.lines
-    assert (set(line.get_xdata()), line.get_color()) == ({1.5}, theme.ink)
-    marks = [x for x in lines if x.get_linewidth() == 0]
-    assert [x.get_marker() for x in marks] == ["o", "X"]
-    assert [x.get_color() for x in marks] == [theme.curves[0], theme.ink]
-    for mark, track in zip(marks, tracks().tracks, strict=True):
-        np.testing.assert_array_equal(np.round(mark.get_ydata()), track.rows)
-        np.testing.assert_array_equal(np.round(mark.get_xdata()), range(4))
-    assert not set(zip(*marks[0].get_data(), strict=True)) & set(
-        zip(*marks[1].get_data(), strict=True)
-    )
-    squares = [x for x in axes.patches if x.get_height() < 1]
-    assert [round(x.get_y() + 0.46) for x in squares] == [0, 2, 1, 1]
-    assert [x.get_linestyle() == "solid" for x in squares] == [True, False, True, False]
-    columns = [x.get_x() + 0.5 for x in axes.patches if x.get_height() == 3]
-    assert columns == [0, 2]
-
-
-def test_tracks_say_the_same_in_words():
-    assert tracks().table.columns == ["trial", "goal", "robot", "static"]
-    assert tracks().table.rows == [
-        ["1", "a, reached", "a", "a"],
-        ["2", "c, missed", "b, told", "a"],
-        ["3", "b, reached", "b", "a"],
-        ["4", "b, missed", "c", "a"],
-    ]
-    told = "Walk: endpoint of robot, static against trial; goal reached in 2 of 4"
-    assert plots.description(tracks()) == told
-    assert plots.note(tracks()) == ""
 
 
 @pytest.mark.parametrize(
@@ -369,21 +154,172 @@ def test_tracks_say_the_same_in_words():
     ],
 )
 def test_cells(cell, text):
-    assert shown(cell) == text
+    assert shown(cell) == (text, "", "")
 
 
 def test_numbers_stand_right_and_strings_left(html):
     assert re.search(r'<th scope="col" class="number">n</th>', html)
     assert '<td class="number">1.5</td>' in html
-    assert "<td>0.50</td>" in html
+    assert '<th scope="row">0.50</th>' in html
     assert '<td class="number">–</td>' in html
 
 
-def test_short_numbers_of_the_ticks():
-    values = (0.0, -0.5, 950.0, 20_000.0, -1_500.0, 1e6, 2.5e9)
-    assert [plots.short_number(v) for v in values] == [
-        *("0", "−0.5", "950", "20k", "−1.5k", "1M", "2.5G")
+@pytest.mark.parametrize(
+    ("summary", "text", "small"),
+    [
+        (Summary([0.5]), "0.500", ""),
+        (Summary([0.5], digits=1), "0.5", ""),
+        # Means of two draws from {0, 1}: 0, ½, 1 with ¼, ½, ¼.
+        (Summary([0.0, 1.0], [3, 4]), "0.50 [0.00, 1.00]", "0.00, 1.00"),
+        (Summary([0.5, 0.5, 0.5], scale=100.0), "50.0 [50.0, 50.0]", "50.0, 50.0, 50.0"),
+        (Summary([12345.0, 12345.0]), "12,345 [12,345, 12,345]", "12,345, 12,345"),
+        (Summary([-0.2, -0.2]), "−0.200 [−0.200, −0.200]", "−0.200, −0.200"),
+        (Summary([1.0, None, float("nan"), 1.0]), "1.00 [1.00, 1.00]", "1.00, –, –, 1.00"),
+        (Summary([None, float("nan")]), "–", ""),
+        (Summary([0.0, 0.0]), "0 [0, 0]", "0, 0"),
+        (Summary([0.0, 1.0, 2.0, 100.0], centre="iqm", digits=1), "1.5 [", "0.0, 1.0, 2.0, 100.0"),
+        (Summary([1.0] * 5 + [3.0, None]), "1.33 [1.00, 2.00]", "1.00 … 3.00, n = 6"),
+    ],
+)
+def test_a_summary_is_its_centre_with_an_interval_and_every_run(summary, text, small):
+    found = shown(summary)
+    assert found.text == text or (text.endswith("[") and found.text.startswith(text))
+    assert found.small == small
+
+
+def test_a_summary_tells_every_seed_and_its_column_what_it_is():
+    runs = Summary([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], range(10, 16))
+    page = Page("p", "", "", [Table("t", ["method", "share"], [["a", runs]])])
+    html = render(page)
+    every = ", ".join(f"seed {10 + i}: 0.{i + 1}00" for i in range(6))
+    assert f'title="{every}"' in html
+    assert '<th scope="col" class="number">share</th>' in html
+    assert "<small>0.100 … 0.600, n = 6</small>" in html
+    assert statistics.NOTE.format(centre="mean") in html
+
+
+def test_interval_of_a_summary_is_known_where_all_resamples_can_be_counted():
+    # All 3125 resamples of five values: the quantiles of their means.
+    x = np.array([0.1, 0.4, 0.5, 0.9, 1.7])
+    every = x[np.stack(np.meshgrid(*[range(5)] * 5)).reshape(5, -1)].mean(axis=0)
+    value, low, high = statistics.centred(x)
+    assert value == pytest.approx(0.72)
+    np.testing.assert_allclose([low, high], np.quantile(every, [0.025, 0.975]), atol=0.03)
+    assert np.isnan(statistics.centred([0.5])[1:]).all()
+
+
+def test_a_banner_stands_before_everything(tmp_path):
+    page = Page("p", "lead", "", [], banner=SMOKE)
+    html = render(page)
+    assert html.index(SMOKE) < html.index("<h1>")
+    assert f"> **{SMOKE}**" in markdown(page, tmp_path).read_text(encoding="utf-8")
+
+
+def test_what_differs_is_marked_and_a_folded_table_opens():
+    table = Table("t", ["setting", "a"], [["x", "1"], ["y", "2"]], marked=[1], folded=True)
+    html = render(Page("p", "", "", [table]))
+    assert "<details><summary>t</summary>" in html
+    (row,) = re.findall(r'<tr class="marked">(.*?)</tr>', html, flags=re.S)
+    assert "y" in row
+    assert "●" in row
+    assert html.count("●") == 1
+
+
+def test_provenance_is_a_table():
+    html = render(Page("p", "", "", [], {"machine": "one", "runs": ["a", "b"]}))
+    assert '<tr><th scope="row">machine</th><td>one</td></tr>' in html
+    assert '<tr><th scope="row">runs</th><td>a<br>b</td></tr>' in html
+
+
+def test_curves_of_one_label_look_alike_in_all_figures_of_a_page():
+    x = np.arange(30)
+    other = figure(curves=[Curve(name, x, [x * 0.1]) for name in ("new", "depth 3", "td3")])
+    html = render(Page("p", "", "", [figure(), other]))
+    found = re.findall(r'style="(stroke: var[^"]*)"/></svg>(depth 3|td3|new|depth 2)<', html)
+    looks = {}
+    for look, name in found:
+        looks.setdefault(name, set()).add(look)
+    assert {name: len(of) for name, of in looks.items()} == dict.fromkeys(looks, 1)
+    assert len(set.union(*looks.values())) == len(looks) == 4
+
+
+def test_neighbouring_figures_stand_together():
+    html = render(Page("p", "", "", [figure(), figure(), Text("t", ["x"]), figure()]))
+    assert re.findall(r'<div class="(figures[^"]*)">', html) == ["figures", "figures alone"]
+    assert groups([]) == []
+
+
+def test_markdown_has_tables_and_pictures_beside_it(tmp_path):
+    drawing = Drawing("Paths", "<svg id='a'/>", "<svg id='b'/>")
+    runs = Summary([0.25, 0.25], [0, 1])
+    many = Summary([0.5] * 6, range(6))
+    rows = [["a|b", runs, 1], ["c", many, None]]
+    table = Table("Scores", ["method", "share", "n"], rows, "By `credo`.", marked=[1])
+    page = Page("Title", "A lead.", "credo x", [figure(), table, drawing], {"seeds": ["0", "1"]})
+    (tmp_path / "figure-7-light.svg").write_text("of an earlier page")
+    (tmp_path / "figure.svg").write_text("of somebody")
+    path = markdown(page, tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "README.md",
+        *(f"figure-{i}-{theme}.svg" for i in (1, 2) for theme in ("dark", "light")),
+        "figure.svg",
     ]
+    text = path.read_text(encoding="utf-8")
+    lines = text.splitlines()
+    assert lines[:6] == ["# Title", "", "A lead.", "", "Made by", ""]
+    assert lines[6:9] == ["```sh", "credo x", "```"]
+    i = lines.index("| method | share | n |")
+    assert lines[i - 1] == ""
+    assert lines[i + 1] == "| --- | ---: | ---: |"
+    small = "0.250 [0.250, 0.250]<br><sub>0.250, 0.250</sub>"
+    assert lines[i + 2] == f"| a\\|b | {small} | 1 |"
+    assert lines[i + 3].startswith("| ● c | 0.500 [0.500, 0.500]<br><sub>0.500 … 0.500, n = 6")
+    assert "By `credo`." in text
+    assert "- c, share: seed 0: 0.500, seed 1: 0.500" in text
+    assert "| seeds | 0<br>1 |" in text
+    assert 'srcset="figure-1-dark.svg"><img src="figure-1-light.svg"' in text
+    svg = (tmp_path / "figure-1-light.svg").read_text(encoding="utf-8")
+    assert svg.startswith('<svg xmlns="http://www.w3.org/2000/svg"')
+    assert ">depth 2</text>" in svg  # it has its legend inside
+    assert (tmp_path / "figure-2-dark.svg").read_text() == "<svg id='b'/>\n"
+
+
+def test_the_same_page_is_the_same_markdown(tmp_path):
+    a, b = (markdown(full_page(), tmp_path / name).parent for name in "ab")
+    assert {p.name: p.read_bytes() for p in a.iterdir()} == {
+        p.name: p.read_bytes() for p in b.iterdir()
+    }
+
+
+def test_nothing_a_label_holds_is_markup_in_markdown(tmp_path):
+    text = markdown(full_page(), tmp_path).read_text(encoding="utf-8")
+    outside = re.sub(r"```+.*?```+", "", text, flags=re.S)
+    assert "<script" not in outside
+    assert set(re.findall(r"<(/?[a-z0-9]+)", outside)) <= {
+        *("picture", "source", "img", "/picture", "details", "/details", "summary", "/summary"),
+        *("br", "sub", "/sub"),
+    }
+    # Inside HTML, as in the summary of a folded table, a link of Markdown is none.
+    lines = [x for x in outside.splitlines() if not x.startswith(("<details>", "<picture>"))]
+    assert all("](b)" not in line.replace("\\](b)", "") for line in lines)
+    assert all(line.count("`") == line.count("\\`") for line in lines)
+    rows = [line for line in outside.splitlines() if line.startswith("| ")]
+    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} <= {3, 4}
+
+
+@pytest.mark.parametrize(
+    ("text", "escaped"),
+    [
+        ("champion_score of 3 * 4", "champion_score of 3 \\* 4"),
+        ("_a_ | $x$", "\\_a\\_ \\| \\$x\\$"),
+        ("# no heading", "\\# no heading"),
+        ("1. no list", "1\\. no list"),
+        ("-0.5 [0, 1]", "-0.5 [0, 1]"),
+        ("a\nb <b>", "a b &lt;b&gt;"),
+    ],
+)
+def test_text_in_markdown(text, escaped):
+    assert markdown_text(text) == escaped
 
 
 def test_many_long_curves_stay_a_light_page(tmp_path):
@@ -393,17 +329,10 @@ def test_many_long_curves_stay_a_light_page(tmp_path):
     assert path.stat().st_size < 1_000_000
 
 
-def test_png_is_written_with_its_title(tmp_path):
-    path = plots.save_png(figure(), tmp_path / "figure.png", dark=True)
-    header = path.read_bytes()[:24]
-    assert header[:8] == b"\x89PNG\r\n\x1a\n"
-    assert int.from_bytes(header[16:20]) == 960
-
-
 def test_describing_a_page_loads_neither_jax_nor_matplotlib():
     program = (
-        "import sys, credo.report.page; "
-        "print([m for m in ('jax', 'matplotlib') if m in sys.modules])"
+        "import sys, credo.report.sections; "
+        "print([m for m in ('jax', 'matplotlib', 'scipy') if m in sys.modules])"
     )
     run = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
@@ -422,12 +351,13 @@ def test_describing_a_page_loads_neither_jax_nor_matplotlib():
         (lambda: figure(curves=[]), "at least one"),
         (lambda: figure(log_x=True), "not positive"),
         (lambda: figure(y_range=(1.0, 0.0)), r"give \(low, high\)"),
-        (lambda: figure(centre="mode"), "'mean' or 'median'"),
+        (lambda: figure(centre="mode"), "'mean', 'median' or 'iqm'"),
         (lambda: heat_map(row_labels=["a"]), r"values must be \[rows, columns\]"),
         (lambda: tracks(goals=[0]), r"\[4, 1, 4, 4, 4\] outcomes, goals, rows and notes: give"),
         (lambda: tracks(tracks=[]), "0 tracks .* give at least one track"),
         (lambda: tracks(goals=[0, 1, 2, 3]), r"goal in rows \[0, 1, 2, 3\]: each must be in 0..2"),
         (lambda: Table("t", ["a", "b"], [("x",)]), "a row of 1 cells"),
+        (lambda: Summary([1.0, 2.0], [0]), "2 values and 1 seeds"),
     ],
 )
 def test_errors_say_what_is_allowed(make, message):

@@ -1,4 +1,4 @@
-"""The page about runs: seeds together, settings apart, scores beside floor and ceiling."""
+"""The page about runs: seeds together, settings apart, scores beside baseline and upper bound."""
 
 import json
 import types
@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 
 from credo import tree
+from credo.algorithms.bptt import BPTT
+from credo.algorithms.ccea import CCEA
+from credo.algorithms.erl import ERL
+from credo.algorithms.merl import MERL
 from credo.algorithms.neuroevolution import Neuroevolution
+from credo.algorithms.off_policy import OffPolicy
+from credo.algorithms.ppo import PPO
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy
+from credo.environments.rover import Rover
 from credo.environments.sequence_classification import SequenceClassification
+from credo.learners.td3 import TD3
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.report import run_page as report
@@ -27,13 +35,19 @@ TASK = SequenceClassification(depth=2, min_gap=1, max_gap=2)
 ALGORITHM = Neuroevolution(TASK, MMU(hidden=3), population_size=10, episodes=4, test_episodes=6)
 
 
-def fake(path, algorithm, seed, scores):
-    """A run with these scores, without the training."""
+def fake(path, algorithm, seed, scores, frames=None):
+    """A run with these scores, without the training. `frames`: of its first generation."""
     path.mkdir(parents=True)
     record = {"algorithm": config.to_tree(algorithm), "seed": seed, "machine": config.machine()}
+    record |= {"budget": {"frames": 1000}} if frames else {}
     config.write_json(path / "config.json", record)
     rows = [
-        {"generation": g + 1, "frames": 10 * g, "champion_score": s, "fitness_max": 2.0 * s}
+        {
+            "generation": g + 1,
+            "frames": (frames or 0) + 10 * g,
+            "champion_score": s,
+            "fitness_max": 2.0 * s,
+        }
         for g, s in enumerate(scores)
     ]
     log.Log(path, 0, tensorboard=False).append(rows, 1.0, 1.0)
@@ -46,8 +60,8 @@ def page_of(monkeypatch, tmp_path):
     pages = []
     monkeypatch.setattr(report, "write_page", lambda page, target: pages.append(page))
 
-    def of(*paths) -> Page:
-        report.write(list(paths), tmp_path / "page.html")
+    def of(*paths, **options) -> Page:
+        report.write(list(paths), tmp_path / "page.html", **options)
         return pages[-1]
 
     return of
@@ -60,49 +74,104 @@ def test_seeds_are_one_curve_and_settings_are_two(page_of, tmp_path):
         fake(tmp_path / "b", ALGORITHM, 1, [0.5, 0.75]),  # still running
         fake(tmp_path / "c", wider, 0, [1.0, 1.0, 1.0]),
     )
-    scores, fitness, table, settings = page.sections
-    narrow, wide = "Neuroevolution: network.hidden 3", "Neuroevolution: network.hidden 4"
+    scores, fitness, table, few, every = page.sections
+    narrow, wide = "neuroevolution: hidden 3", "neuroevolution: hidden 4"
     assert [curve.label for curve in scores.curves] == [narrow, wide]
     np.testing.assert_array_equal(scores.curves[0].runs, [[0.0, 0.25], [0.5, 0.75]])
     np.testing.assert_array_equal(scores.curves[0].x, [1, 2])
     np.testing.assert_array_equal(fitness.curves[1].runs, [[2.0, 2.0, 2.0]])
     assert [(r.label.split(":")[0], r.value) for r in scores.references] == [
-        ("floor", pytest.approx(0.75)),
-        ("ceiling", 1.0),
+        ("baseline", pytest.approx(0.75)),
+        ("upper bound", 1.0),
+    ]
+    assert table.columns == [
+        *("algorithm", "best policy", "baseline", "upper bound", "seeds", "generations")
     ]
     # The last generation of each run: 0.5 and 0.75.
-    assert table.rows[0][:3] == [narrow, "2", "2"]
-    assert table.rows[0][4:6] == ["0.625 ± 0.125", "0.625"]
-    assert table.rows[1][4:6] == ["1.000", "1.000"]
-    assert ["network.hidden", "3", "4"] in settings.rows
-    assert page.facts["seeds"] == f"{narrow}: 0, 1; {wide}: 0"
+    name, score, baseline, bound, seeds, generations = table.rows[0]
+    assert (name, bound, seeds, generations) == (narrow, 1.0, 2, 2)
+    assert (score.values, score.seeds) == ([0.5, 0.75], [0, 1])
+    assert baseline.startswith("0.750 (")
+    assert table.rows[1][1].values == [1.0]
+    assert few.rows == [["network.hidden", "3", "4"]]
+    assert every.folded
+    assert [every.rows[i] for i in every.marked] == few.rows
+    assert len(every.rows) > 10
+    assert page.facts["seeds"] == [f"{narrow}: 0, 1", f"{wide}: 0"]
     assert page.command == f"credo report {tmp_path / 'a'} {tmp_path / 'b'} {tmp_path / 'c'}"
 
 
-def test_groups_that_the_first_fields_cannot_tell_apart_stay_apart(page_of, tmp_path):
-    def variant(depth, size, elites, episodes):
-        task = SequenceClassification(depth, 1, 2)
-        return Neuroevolution(task, MMU(hidden=3), size, elites, episodes, test_episodes=6)
+def test_algorithms_are_called_what_the_command_calls_them():
+    task, team = Copy(), Rover()
+    made = {
+        **{name: ERL.presets()[name](task) for name in ("ea", "erl", "cerl")},
+        **{name: OffPolicy.presets()[name](task) for name in ("td3", "ddpg", "sac")},
+        **{name: OffPolicy.presets()[name](team) for name in ("matd3", "maddpg")},
+        "merl": MERL(team),
+        "ccea": CCEA.ccea(team),
+        "neuroevolution": ALGORITHM,
+        "ppo": PPO.ppo(task),
+        "bptt": BPTT(TASK),
+    }
+    trees = {name: config.to_tree(algorithm) for name, algorithm in made.items()}
+    assert {name: report.word(tree) for name, tree in trees.items()} == {n: n for n in made}
+    assert report.group_labels(list(trees.values())) == list(made)
+    assert report.word(config.to_tree(OffPolicy.td3(team))) == "td3"
+    assert report.word({"class": "mine.tools:MySearch"}) == "MySearch"
 
-    settings = [(2, 10, 0.1, 4), (2, 10, 0.1, 5), (3, 20, 0.2, 6)]
-    page = page_of(
-        *(
-            fake(tmp_path / str(i), variant(*values), 0, [i / 4, i / 4])
-            for i, values in enumerate(settings)
-        )
-    )
-    table = page.sections[2].rows
-    assert [row[4] for row in table] == ["0.000", "0.250", "0.500"]
-    assert len({row[0] for row in table}) == 3
-    assert "episodes 5" in table[1][0]
+
+def test_labels_have_the_fewest_fields_that_tell_settings_apart():
+    def labels(*algorithms):
+        return report.group_labels([config.to_tree(algorithm) for algorithm in algorithms])
+
+    task = Copy()
+    rates = [OffPolicy.td3(task, learner=TD3(actor_lr=rate)) for rate in (1e-4, 1e-3)]
+    assert labels(ERL.erl(task), *rates) == ["erl", "td3: actor_lr 0.0001", "td3: actor_lr 0.001"]
+    # Sizes alone would do; with two values each it takes two fields.
+    four = [
+        ERL.erl(task, population_size=size, episodes=episodes)
+        for size in (10, 20)
+        for episodes in (1, 2)
+    ]
+    assert labels(*four)[0] == "erl: population_size 10, episodes 1"
+    assert len(set(labels(*four))) == 4
 
 
-def test_a_task_without_a_known_floor_says_so(page_of, tmp_path):
+def test_groups_that_three_fields_cannot_tell_apart_are_numbered():
+    tree = {"class": "credo.algorithms.erl:ERL", "learners": [], **dict.fromkeys("abcd", 0)}
+    labels = report.group_labels([tree, *({**tree, name: 1} for name in "abcd")])
+    assert len(set(labels)) == 5
+    assert sum(label.endswith("(2)") for label in labels) == 1
+    assert all(label.count(",") <= 2 for label in labels)
+
+
+def test_a_reader_may_give_labels(page_of, tmp_path, monkeypatch):
+    wider = Neuroevolution(TASK, MMU(hidden=4), population_size=10, episodes=4, test_episodes=6)
+    paths = [fake(tmp_path / "a", ALGORITHM, 0, [0.5]), fake(tmp_path / "b", wider, 0, [0.5])]
+    page = page_of(*paths, labels=["narrow", "wide"])
+    assert [curve.label for curve in page.sections[0].curves] == ["narrow", "wide"]
+    for labels in (["narrow"], ["same", "same"]):
+        with pytest.raises(RunError, match=r"for 2 curves: give one for each of neuroevolution: h"):
+            page_of(*paths, labels=labels)
+
+
+def test_a_task_without_a_known_baseline_says_so(page_of, tmp_path):
     algorithm = Neuroevolution(Copy(), MMU(hidden=3), test_episodes=6)
     page = page_of(fake(tmp_path / "a", algorithm, 0, [0.0, 0.5]))
     assert page.sections[0].references == ()
-    assert page.sections[2].rows[0][3] == page.sections[2].rows[0][6] == "not known"
+    assert page.sections[2].columns == ["algorithm", "best policy", "seeds", "generations"]
+    assert "No baseline and no upper bound of this task are known." in page.sections[2].caption
     assert page.lead == f"Task: {config.brief(config.to_tree(Copy()))}."
+
+
+def test_a_run_of_one_generation_is_a_point_on_the_frames_axis(page_of, tmp_path):
+    paths = [
+        fake(tmp_path / str(seed), ALGORITHM, seed, [score], frames=100 + seed)
+        for seed, score in enumerate((0.25, 0.75))
+    ]
+    curve = page_of(*paths).sections[0].curves[0]
+    assert curve.x[-1] == 101
+    assert [runs[-1] for runs in curve.runs] == [0.25, 0.75]
 
 
 def test_the_page_of_a_stranger_s_run_imports_nothing(page_of, tmp_path, monkeypatch):
@@ -116,7 +185,7 @@ def test_the_page_of_a_stranger_s_run_imports_nothing(page_of, tmp_path, monkeyp
     for name, algorithm in {"hosted": hosted, "own": own}.items():
         page = page_of(fake(tmp_path / name, algorithm, 0, [0.0, 0.5]))
         assert "Task" in page.lead
-        assert page.sections[2].rows[0][4] == "0.500"
+        assert page.sections[2].rows[0][1].values == [0.5]
     assert not (tmp_path / "executed").exists()
 
 
@@ -139,7 +208,7 @@ def test_the_page_is_written_and_holds_the_numbers(tmp_path):
     page = target.read_text()
     assert target == tmp_path / "deep" / "er" / "page.html"
     assert "0.500" in page
-    assert "Neuroevolution: 5" in page
+    assert "neuroevolution: 5" in page
     assert page.count("<svg") >= 2
 
 

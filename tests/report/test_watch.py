@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from typing import ClassVar
@@ -18,12 +19,14 @@ from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.base import AbstractEnvironment
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.pettingzoo import PettingZoo
+from credo.environments.probes import Copy
 from credo.environments.sequence_recall import SequenceRecall
 from credo.environments.wrappers import DelayedHostReward, DelayedReward
 from credo.networks.mlp import MLP
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team
-from credo.report.watch import _maker, _takes, _write_mp4, watch
+from credo.report.films import _maker, _takes, film
+from credo.report.watch import watch
 from credo.runs import checkpoint, config
 from credo.runs.record import RunError
 from credo.runs.store import Run
@@ -177,9 +180,36 @@ def test_an_mp4_has_the_same_pictures(tmp_path):
 
 def test_what_ffmpeg_refuses_is_told(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
-    pictures = iter([np.zeros((4, 4, 3), np.uint8)] * 3)
+
+    def lost():
+        with film(tmp_path / "film.mp4", 10) as add:
+            shutil.rmtree(next(tmp_path.glob(".film*")))
+            for _ in range(3):
+                add(np.zeros((4, 4, 3), np.uint8))
+
     with pytest.raises(RunError, match=r"ffmpeg says .*No such file or directory"):
-        _write_mp4(tmp_path / "nowhere" / "film.mp4", pictures, 10)
+        lost()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_two_writers_of_one_film_do_not_mix(tmp_path, suffix):
+    if suffix == "mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    path, alone = tmp_path / f"film.{suffix}", tmp_path / f"alone.{suffix}"
+    white = np.full((8, 8, 3), 255, np.uint8)
+    with film(path, 10) as first:
+        first(white // 2)
+        with film(path, 10) as second:
+            second(white)
+            first(white // 3)
+        between = path.read_bytes()
+        first(white // 4)
+    with film(alone, 10) as add:
+        for part in (2, 3, 4):
+            add(white // part)
+    assert path.read_bytes() == alone.read_bytes() != between
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([alone.name, path.name])
 
 
 def test_without_ffmpeg_the_extra_is_named(tmp_path, monkeypatch):
@@ -195,13 +225,15 @@ def test_without_a_name_the_film_lies_in_the_run(tmp_path):
     assert len(frames(run.path / "champion.gif")[0]) == LENGTH + 1
 
 
-@pytest.mark.parametrize("output", [None, "film.gif"])
-def test_a_task_of_numbers_has_nothing_to_draw(tmp_path, output):
-    run = made(tmp_path / "run", SequenceRecall(depth=2))
-    told = r"nothing to draw.*rovers, T-mazes, tasks of Gymnasium.*\. `credo report .*run` shows"
+def test_a_task_of_numbers_has_nothing_to_draw(tmp_path):
+    told = r"Copy has nothing to draw.*rovers, T-mazes.*\. `credo report .*run` shows"
     with pytest.raises(RunError, match=told):
-        watch(run, output and tmp_path / output)
-    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+        watch(made(tmp_path / "run", Copy()))
+    recall = made(tmp_path / "recall", SequenceRecall(depth=2))
+    with pytest.raises(ValueError, match=r"film\.gif': its name must end in \.html$"):
+        watch(recall, tmp_path / "film.gif")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["recall", "run"]
+    assert "direction" in watch(recall).read_text()
 
 
 def test_a_wrapper_that_hands_render_mode_on_is_drawn(tmp_path):

@@ -99,7 +99,7 @@ def start(run: pathlib.Path, what: str, generations: int, output=subprocess.PIPE
         budget = ["--generations", str(generations), "--path", str(run)]
         arguments = ["train", algorithm, task, *budget, *often, *flags]
     return subprocess.Popen(
-        [sys.executable, "-m", "credo.cli", *arguments],
+        [sys.executable, "-m", "credo", *arguments],
         stdout=output,
         stderr=subprocess.STDOUT,
         text=True,

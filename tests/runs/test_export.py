@@ -11,6 +11,7 @@ from safetensors import safe_open
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments import adapters
 from credo.environments.gymnasium import Gymnasium
+from credo.environments.probes import Copy
 from credo.environments.sequence_recall import SequenceRecall
 from credo.environments.simple_spread import SimpleSpread
 from credo.environments.wrappers import DelayedHostReward
@@ -296,3 +297,10 @@ def test_a_champion_that_cannot_act_is_not_written(tmp_path):
         export(run, target)
     assert target.read_text() == "the one before"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["p.safetensors", "run"]
+
+
+def test_a_folder_that_is_not_there_is_not_made(tmp_path):
+    run = made(tmp_path / "run", Copy(), MLP(hidden=(4,)))
+    with pytest.raises(RunError, match=r"nowhere is no folder: make it first"):
+        export(run, tmp_path / "nowhere" / "policy.safetensors")
+    assert not (tmp_path / "nowhere").exists()

@@ -310,6 +310,15 @@ def test_a_class_of_a_notebook_trains_but_goes_on_there_alone(tmp_path):
         resume(tmp_path / "run", generations=3)
 
 
+def test_what_is_advised_is_possible(finished):
+    run = loop.Run(finished)
+    assert run.advice == f"`credo resume {finished}`"
+    run.config["resumable"] = False  # of a class that was made in a notebook
+    assert run.advice == (
+        f"credo.resume('{finished}') in this process, which alone knows its classes"
+    )
+
+
 def test_a_task_that_changed_is_said_in_words(finished, monkeypatch):
     monkeypatch.setattr(Copy, "obs_size", Copy().obs_size + 1)
     told = r"Copy has \d numbers in an observation today and \d when this run began"

@@ -403,7 +403,7 @@ def test_a_signal_saves_and_says_how_to_go_on(tmp_path, number, code):
     arguments += " --population-size 10 --episodes 4 --test-episodes 6 --network.hidden 3"
     arguments += f" --generations 1000000 --tensorboard False --path {path}"
     process = subprocess.Popen(
-        [sys.executable, "-m", "credo.cli", *arguments.split()],
+        [sys.executable, "-m", "credo", *arguments.split()],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -553,7 +553,7 @@ def test_a_run_with_a_mutation_of_a_script_can_be_reopened(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     done = subprocess.run(
-        [sys.executable, "-m", "credo.cli", "evaluate", "run", "--episodes", "2"],
+        [sys.executable, "-m", "credo", "evaluate", "run", "--episodes", "2"],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -137,7 +137,7 @@ def test_a_screen_that_knows_ascii_alone_gets_that():
 
 
 TRAIN = (
-    "{python} -m credo.cli train neuroevolution sequence-classification --depth 2 --min-gap 1 "
+    "{python} -m credo train neuroevolution sequence-classification --depth 2 --min-gap 1 "
     "--max-gap 2 --population-size 10 --episodes 4 --test-episodes 6 --network.hidden 3 "
     "--generations 1000000 --tensorboard False --checkpoint-every 1000 --path {path}"
 )

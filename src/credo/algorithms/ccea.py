@@ -30,24 +30,26 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
 from ..compilation import float32, jit
-from ..evolution.crossover import AbstractCrossover, MaskedCrossover
+from ..evolution.breeder import Breeder, draw, evolving
 from ..evolution.extinction import Extinction
-from ..evolution.islands import Islands
-from ..evolution.mutation import AbstractMutation, MatrixMutation
-from ..evolution.selection import AbstractSelection, Tournament, rankable
+from ..evolution.selection import rankable
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.mlp import MLP
 from ..networks.team import Team, TeamPolicy
 from ..normalization import Moments, behind, frozen, play
 from ..rollout import Environment, evaluate
 from ..types import Metrics
-from .neuroevolution import breed
+from .fitness import objective
+
+BREEDER = Breeder(elite_fraction=0.04, extinction=Extinction())
 
 
 class CCEAState(eqx.Module):
+    """What CCEA knows between two generations."""
+
     populations: PyTree  # leaves [M, k, ...]; bred, not yet evaluated
     champion: AbstractPolicy  # the best of each population, together
-    moments: Moments | None  # of what was seen; None: observations are as they are
+    moments: Moments | None  # of all observations; None: they are not normalised
 
 
 class CCEA(eqx.Module):
@@ -57,27 +59,26 @@ class CCEA(eqx.Module):
 
     env: Environment
     network: AbstractNetwork = MLP(hidden=(20,))  # of one agent
-    population_size: int = eqx.field(static=True, default=100)  # k, of each population
-    elite_fraction: float = eqx.field(static=True, default=0.04)
-    teams: int = eqx.field(static=True, default=5)  # φ: per individual, on average
-    episodes: int = eqx.field(static=True, default=7)  # z: simulations of each team
-    test_episodes: int = eqx.field(static=True, default=15)  # fresh ones, for the champion team
+    population_size: int = eqx.field(static=True, default=100)
+    """k: members of each population, at least 2."""
+    breeder: Breeder = BREEDER
+    """How the next population of each agent is made of this one."""
+    teams: int = eqx.field(static=True, default=5)
+    """φ: teams that an individual plays in, on average, at least 1."""
+    episodes: int = eqx.field(static=True, default=7)
+    """z: simulations of each team, averaged for its reward, at least 1."""
+    test_episodes: int = eqx.field(static=True, default=15)
+    """Fresh episodes in a test of the champion team, at least 1; their frames are not counted."""
     teaming: Literal["random", "balanced"] = eqx.field(static=True, default="random")
+    """How teams are drawn: `random`, so that an individual plays in φ on average, or `balanced`, so
+    that it plays in exactly φ."""
     assignment: Literal["mean", "best"] = eqx.field(static=True, default="mean")
-    selection: AbstractSelection = Tournament()
-    mutation: AbstractMutation = MatrixMutation()
-    crossover: AbstractCrossover = MaskedCrossover()
-    crossover_probability: float = 0.0
-    cross_repeated: bool = eqx.field(static=True, default=False)
-    mating: tuple[AbstractCrossover, ...] = ()  # as in Neuroevolution
-    extinction: Extinction = Extinction()
-    islands: Islands | None = None
-    """Of each population. Every island then has its share of the elites, its own tournaments, mates
-    and events of extinction."""
-    fitness: str | None = eqx.field(static=True, default=None)  # signal; None: the task's first
+    """Fitness of an individual: the `mean` over its teams, or the `best` of them."""
+    fitness: str | None = eqx.field(static=True, default=None)
+    """Name of the reward that is assigned; None: the task's first."""
     normalize_observations: bool = eqx.field(static=True, default=False)
-    """All populations see observations by the running mean and variance of all that was seen; the
-    champion keeps them. A generation's observations are recorded for it."""
+    """Policies see observations normalised by the running mean and variance of all observations so
+    far, which are recorded for it; the champion keeps them."""
 
     def __check_init__(self):
         if self.network.team:
@@ -89,24 +90,16 @@ class CCEA(eqx.Module):
         require.fits(self.env, Team(head=self.network))
         for name in ("teams", "episodes", "test_episodes"):
             require.at_least(name, getattr(self, name), 1)
-        require.within("crossover_probability", self.crossover_probability, 0, 1)
         require.choice("teaming", self.teaming, ("random", "balanced"))
         require.choice("assignment", self.assignment, ("mean", "best"))
-        require.signal(self.fitness, self.env.signals)
-        require.at_least("population_size", self.population_size, 2)
-        if self.islands is None:
-            require.room(self.elite_fraction, self.population_size, 0, 0)
-        elif isinstance(self.islands, Islands):
-            size = self.islands.size(self.population_size)
-            require.room(self.elite_fraction, size, 0, 0, "members of an island")
-        else:
-            raise TypeError(f"islands is {self.islands!r}: give Islands(number=4), or None")
+        objective(self.env, self.fitness)
+        self.breeder.check(self.population_size, self.network)
 
     @classmethod
-    def ccea(cls, env: Environment, network: AbstractNetwork | None = None, **overrides):
-        """The settings of section 4.1.2."""
+    def ccea(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """The settings of section 4.1.2. `overrides`: fields of `CCEA`, and of its breeder."""
         given: dict[str, Any] = {} if network is None else {"network": network}
-        return cls(env, **given | overrides)
+        return cls(env, **evolving(BREEDER, given | overrides))
 
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
@@ -115,9 +108,8 @@ class CCEA(eqx.Module):
 
     @property
     def elites(self) -> int:
-        """Of each population, those of all its islands."""
-        n = self.islands.number if self.islands else 1
-        return n * int(self.elite_fraction * (self.population_size // n))
+        """Members of each population that are kept unchanged, those of all its islands."""
+        return self.breeder.elites(self.population_size)
 
     @property
     def agents(self) -> int:
@@ -125,26 +117,21 @@ class CCEA(eqx.Module):
         return self.env.sizes[2]
 
     @property
-    def signal(self) -> str:
+    def reward(self) -> str:
         """The reward that is assigned."""
-        return self.fitness or self.env.signals[0]
+        return objective(self.env, self.fitness)
 
     @property
     def simulations(self) -> int:
         """z: of each team; of an individual without partners what its φ teams would have."""
         return self.episodes * (self.teams if self.agents == 1 else 1)
 
-    def new_population(self, size: int | None = None, *, key: PRNGKeyArray) -> PyTree:
-        """`size` members instead of `population_size`."""
-        return eqx.filter_vmap(lambda key: self.network.init(*self.env.sizes[:2], key=key))(
-            jax.random.split(key, self.population_size if size is None else size)
-        )
-
     @float32()
     def init(self, *, key: PRNGKeyArray) -> CCEAState:
-        # 1: Initialize M populations of k neural network policies.
-        keys = jax.random.split(key, self.agents)
-        populations = eqx.filter_vmap(lambda key: self.new_population(key=key))(keys)
+        """1: Initialize M populations of k neural network policies."""
+        keys, k = jax.random.split(key, self.agents), self.population_size
+        fresh = partial(draw, self.network, self.env.sizes[:2], k)
+        populations = eqx.filter_vmap(lambda key: fresh(key=key))(keys)
         first = jnp.zeros((self.agents, 1), jnp.int32)
         moments = Moments.first(self.env, self.network) if self.normalize_observations else None
         champion = frozen(moments, tree.take(drafted(self, populations, first), 0))
@@ -160,14 +147,14 @@ class CCEA(eqx.Module):
         teams = drafted(self, state.populations, members)
         # 7-8: run z independent simulations for team T_i; assign reward to each of its members.
         played, moments = play(self.env, teams, self.simulations, state.moments, key=play_key)
-        fitness = assigned(self, members, played.returns[self.signal])
+        fitness = assigned(self, members, played.returns[self.reward])
         # 9-21: for each population: rank, keep the elites, select, mutate; now and then extinction.
         best = jnp.argmax(rankable(fitness), axis=1)
         champion = behind(state.moments, drafted(self, state.populations, best[:, None]))
-        populations = bred(self, state.populations, fitness, key=breed_key)
+        populations = breed(self, state.populations, fitness, key=breed_key)
 
         test = evaluate(self.env, champion, self.test_episodes, key=test_key)
-        returns = played.of(self.signal)
+        returns = played.of(self.reward)
         metrics = {
             "fitness_max": jnp.max(rankable(jnp.mean(returns, axis=1))),
             "fitness_mean": jnp.nanmean(returns),
@@ -197,26 +184,16 @@ def drafted(ccea: CCEA, populations: PyTree, members: Int[Array, "agents teams"]
 
 
 @jit
-def bred(
+def breed(
     ccea: CCEA, populations: PyTree, fitness: Float[Array, "agents k"], *, key: PRNGKeyArray
 ) -> PyTree:
     """The next generation of each population."""
-    keys = jax.random.split(key, ccea.agents)
+    fresh = partial(draw, ccea.network, ccea.env.sizes[:2])
 
     def one(population, fitness, key):
-        if ccea.islands is None:
-            return breed(ccea, population, fitness, key=key)
-        size = ccea.islands.size(ccea.population_size)
-        breed_key, fresh_key = jax.random.split(key)
-        return ccea.islands(
-            partial(breed, ccea),
-            lambda: ccea.new_population(size, key=fresh_key),
-            population,
-            fitness,
-            key=breed_key,
-        )
+        return ccea.breeder(population, fitness, fresh, key=key)[0]
 
-    return eqx.filter_vmap(one)(populations, fitness, keys)
+    return eqx.filter_vmap(one)(populations, fitness, jax.random.split(key, ccea.agents))
 
 
 @jit

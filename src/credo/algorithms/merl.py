@@ -24,6 +24,7 @@ Departures from the printed box:
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import ClassVar, Self
 
 import equinox as eqx
@@ -33,35 +34,22 @@ from jaxtyping import PRNGKeyArray
 
 from .. import require
 from ..compilation import float32
-from ..evolution.crossover import AbstractCrossover, MaskedCrossover
-from ..evolution.mutation import AbstractMutation
-from ..evolution.selection import AbstractSelection, Tournament
+from ..evolution.breeder import Breeder, evolving
 from ..learners.base import AbstractLearner
 from ..learners.td3 import TD3, TEAM
-from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.base import AbstractNetwork
 from ..networks.team import Team
-from ..normalization import behind, frozen
-from ..rollout import Environment, collect
+from ..rollout import Environment
 from ..types import Metrics
-from .erl import (
-    MUTATION,
-    ERLState,
-    begin,
-    breed,
-    explore,
-    improve,
-    inject,
-    most_frames,
-    stored,
-    tested,
-    warm,
-)
+from .erl import BREEDER as ERL_BREEDER
+from .hybrid import Hybrid, HybridState, breed, explore, improve, inject, play, tested
 
 LOCAL = TD3(signal="local", **TEAM)
 """The learner of the team: one twin critic that all agents share (lines 2 and 16-21)."""
+BREEDER = replace(ERL_BREEDER, elite_fraction=0.2, crossover_probability=0.1)
 
 
-class MERL(eqx.Module):
+class MERL(Hybrid):
     """Evolve teams on `fitness` beside learners of each agent's own reward."""
 
     default_budget: ClassVar[dict[str, int]] = {"frames": 2_000_000}
@@ -69,40 +57,41 @@ class MERL(eqx.Module):
     env: Environment
     network: AbstractNetwork = Team()
     learners: tuple[AbstractLearner, ...] = (LOCAL,)
-    population_size: int = eqx.field(static=True, default=20)  # k
-    elite_fraction: float = eqx.field(static=True, default=0.2)
-    episodes: int = eqx.field(static=True, default=10)  # ξ: per fitness
-    selection: AbstractSelection = Tournament()
-    crossover: AbstractCrossover = MaskedCrossover()
-    crossover_probability: float = 0.1  # chance to cross an offspring drawn once
-    mutation: AbstractMutation = MUTATION
-    workers: int = eqx.field(static=True, default=50)  # episodes that learners play, in turn
-    migration_period: int = eqx.field(static=True, default=1)  # in generations
-    updates_per_frame: float = 0.1  # of each learner, for all agents
-    warmup_frames: int = eqx.field(static=True, default=5_120)  # stored before anybody learns
-    replay_capacity: int = eqx.field(static=True, default=100_000)  # joint transitions
-    test_episodes: int = eqx.field(static=True, default=10)  # of the champion; not counted
-    test_every: int = eqx.field(static=True, default=1)  # generations between tests
-    fitness: str | None = eqx.field(static=True, default=None)  # signal; None: what is reported
-    redistribute: bool = eqx.field(static=True, default=False)  # as in ERL
-    normalize_observations: bool = eqx.field(static=True, default=False)  # as in ERL
+    """Learners of the whole team, each of the reward that it names."""
+    population_size: int = eqx.field(static=True, default=20)  # k: teams, at least 2
+    breeder: Breeder = BREEDER
+    """How the next population is made of this one."""
+    episodes: int = eqx.field(static=True, default=10)
+    """ξ: episodes averaged for one fitness value, at least 1."""
+    workers: int = eqx.field(static=True, default=50)
+    """Episodes that all learners together play per generation, in turn, at least 1."""
+    migration_period: int = eqx.field(static=True, default=1)
+    """Generations from one migration of the learners' teams to the next, at least 1."""
+    updates_per_frame: float = 0.1
+    """Gradient updates of each learner, for all agents together, per environment frame of the
+    generation, at least 0."""
+    warmup_frames: int = eqx.field(static=True, default=5_120)
+    """Frames played before learners begin to learn, at least 0."""
+    replay_capacity: int = eqx.field(static=True, default=100_000)
+    """Joint transitions in the replay buffer, at least 1; then the oldest are overwritten."""
+    test_episodes: int = eqx.field(static=True, default=10)
+    """Fresh episodes in a test of the champion, at least 1; their frames are not counted."""
+    test_every: int = eqx.field(static=True, default=1)  # generations between tests, at least 1
+    fitness: str | None = eqx.field(static=True, default=None)
+    """Name of the reward that fitness sums up; None: the task's first."""
+    redistribute: bool = eqx.field(static=True, default=False)
+    """Learners see each episode's return in equal parts over its frames, however late it came."""
+    normalize_observations: bool = eqx.field(static=True, default=False)
+    """Policies see observations normalised by the running mean and variance of all observations so
+    far; the champion keeps them."""
 
     def __check_init__(self):
-        for name, least in (("population_size", 2), ("episodes", 1), ("workers", 1)):
-            require.at_least(name, getattr(self, name), least)
-        for name in ("migration_period", "replay_capacity", "test_episodes", "test_every"):
-            require.at_least(name, getattr(self, name), 1)
-        require.within("crossover_probability", self.crossover_probability, 0, 1)
-        require.at_least("updates_per_frame", self.updates_per_frame, 0)
-        require.fits(self.env, self.network, *self.learners)
-        for signal in (self.fitness, *(learner.signal for learner in self.learners)):
-            require.signal(signal, self.env.signals)
-        require.room(self.elite_fraction, self.population_size, len(self.learners), self.workers)
+        require.at_least("migration_period", self.migration_period, 1)
 
     @classmethod
     def merl(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """The defaults, for the command line."""
-        return cls(env, network or Team(), **overrides)
+        """The defaults, for the command line. `overrides`: fields of `MERL`, and of its breeder."""
+        return cls(env, network or Team(), **evolving(BREEDER, overrides))
 
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
@@ -110,63 +99,31 @@ class MERL(eqx.Module):
         return {"merl": cls.merl}
 
     @property
-    def elites(self) -> int:
-        return int(self.elite_fraction * self.population_size)
-
-    @property
     def manager(self) -> None:
         """Workers play for the learners in turn."""
 
-    @property
-    def signal(self) -> str:
-        """The reward that evolution maximises."""
-        return self.fitness or self.env.reported
-
-    @property
-    def most_frames(self) -> int:
-        """Frames of one generation, at most."""
-        return most_frames(self)
-
     @float32()
-    def init(self, *, key: PRNGKeyArray) -> ERLState:
-        # 1-4: a population of k multi-head teams; learners with a shared critic; replay buffers.
-        return begin(self, key=key)
-
-    def warm(self, state: ERLState, policy: AbstractPolicy) -> ERLState:
-        return warm(self, state, policy)
-
-    @float32()
-    def generation(self, state: ERLState, *, key: PRNGKeyArray) -> tuple[ERLState, Metrics]:
+    def generation(self, state: HybridState, *, key: PRNGKeyArray) -> tuple[HybridState, Metrics]:
         """One pass of the outer loop of Algorithm 13."""
         rollout_key, breed_key, explore_key, learn_key, test_key = jax.random.split(key, 5)
-
         # 6-9: for team π: g, R = Rollout(π, R, noise=None, ξ); g is π's fitness.
-        population = behind(state.moments, state.population)
-        played, experience = collect(self.env, population, self.episodes, key=rollout_key)
-        fitness = jnp.mean(played.of(self.signal), axis=1)
-        memory = stored(self, (state.replay, state.moments), played, experience)
+        state, played = play(self, state, state.population, self.episodes, key=rollout_key)
+        fitness = jnp.mean(played.of(self.reward), axis=1)
 
         # 10-14: rank, keep e elites, select k-e by tournament, cross with elites; and mutate.
-        population, lineage, champion, bred = breed(
-            self, state.population, state.lineage, fitness, key=breed_key
-        )
+        state, bred = breed(self, state, fitness, key=breed_key)
+
         # 8: Rollout(π_pg, R, noise=W_g, ξ=1), in parallel worlds.
-        memory, ledger, counts, explored = explore(self, state, memory, key=explore_key)
-        frames, episodes = jnp.sum(played.steps) + counts[0], played.steps.size + counts[1]
+        state, frames, explored = explore(self, state, key=explore_key)
+        frames = jnp.sum(played.steps) + frames
 
         # 15-21: for agent k: a minibatch from R^k; descend the critic's loss; follow the gradient
         # of Q with head k; move the targets.
-        learners, learned = improve(self, state, memory, frames, key=learn_key)
+        state, learned = improve(self, state, frames, key=learn_key)
 
         # 22: Migrate: the weakest teams become copies of π_pg.
-        generation = state.generation + 1
-        due = (generation % self.migration_period == 0) & (learned["updates"] > 0)
-        migrants = [learner.actor(s) for learner, s in zip(self.learners, learners, strict=True)]
-        population, lineage = inject(population, lineage, migrants, due)
+        due = (state.generation % self.migration_period == 0) & (learned["updates"] > 0)
+        state = inject(self, state, due)
 
-        champion = frozen(state.moments, champion)
-        after = (population, lineage, learners, memory[0], ledger, state.allocation, champion)
-        counted = (state.frames + frames, state.episodes + episodes, generation, memory[1])
         metrics = {"frames": frames} | bred | explored | learned
-        state = ERLState(*after, state.score, *counted)
         return tested(self, state, fitness, metrics, key=test_key)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..evolution.lineage import MAKERS
+from ..algorithms.lineage import MAKERS
 from . import statistics
 
 Floats = NDArray[np.float64]

@@ -236,7 +236,7 @@ def trace_fleet(
     before = (played.observations[:-1], jax.tree.map(lambda x: x[:-1], played.carries))
     return FleetTrace(
         played.rewards["net"],
-        jnp.asarray(played.active)[:-1],
+        jnp.asarray(played.active),
         jnp.argmax(played.actions, axis=2),
         _writes(policy, *before),
         played.carries.memory[1:],
@@ -358,3 +358,25 @@ def _search(env: ServerFleet, rounds: int) -> float:
         return total
 
     return float(value((0,) * env.devices, (env.requests,) * env.devices, rounds))
+
+
+def changes(env: ServerFleet, team: PyTree) -> dict[str, tuple[ServerFleet, PyTree]]:
+    """What may happen to a fleet, by name: the task, and who plays it. Three in ten servers of a
+    DMMU, or of a population of them, leave, or clones of its first half join, in mid-episode or
+    before it."""
+    n, end = env.servers, env.max_steps
+    leave, join, half = max(1, 3 * n // 10), n // 2, end // 2
+    left = n - leave
+    stays, leaves, joins = ((0, end),), ((0, half),), ((half, end),)
+    smaller, larger = team.without(range(left, n)), team.with_clones(range(join))
+    fewer = dataclasses.replace(env, servers=left)
+    more = dataclasses.replace(env, servers=n + join)
+    leaving = dataclasses.replace(env, schedule=stays * left + leaves * leave)
+    joining = dataclasses.replace(more, schedule=stays * n + joins * join)
+    return {
+        f"{n} servers": (env, team),
+        f"{leave} of {n} leave at step {half}": (leaving, team),
+        f"{left} of {n} from the start": (fewer, smaller),
+        f"clones of {join} join at step {half}": (joining, larger),
+        f"clones of {join} from the start": (more, larger),
+    }

@@ -59,7 +59,7 @@ def by_trial(env: ExtendedTMaze, played: Trace, *, memory: bool = True) -> MazeT
     told = last[1][:, :, 1:] > 0.0
     return MazeTrace(
         last[0].goals[np.arange(env.trials), np.arange(env.trials) >> env.depth],
-        played.rewards["score"][ends - 1] > 0.0,
+        np.asarray(played.rewards["score"][ends - 1] > 0.0),
         last[0].endpoint,
         partner,
         told[:, :, 0],

@@ -321,3 +321,31 @@ def describe(roles: tuple[CellRole, ...]) -> str:
             *(f"M{r.cell + 1}: {r.role}" for r in roles),
         ]
     )
+
+
+def probe(policy: AbstractPolicy, task: SequenceClassification) -> dict[str, np.ndarray]:
+    """Table 3.1 of one champion: its memory after every permutation of `task`'s signals.
+
+    **Returns:** by permutation `permutations`, their `sums`, the final `memory`, whether every
+    answer was `right`, and `signatures` (of the cells that are needed); by cell the
+    `masking costs`; the cells `needed`, from 0; the largest difference of a needed cell between
+    permutations of equal sum (`spread`); and whether a signature always means the same class.
+    """
+    states = final_states(policy, task)
+    relevance = relevant_cells(policy, lay_out(task, permutations(task.depth)))
+    final, sums = np.asarray(states.memory), np.asarray(states.sums)
+    needed = list(relevance.needed)
+    spread = [np.ptp(final[sums == x][:, needed], axis=0).max(initial=0.0) for x in np.unique(sums)]
+    signatures = signature(states.memory, relevance.needed)
+    pairs = {(tuple(s), bool(x > 0)) for s, x in zip(signatures.tolist(), sums, strict=True)}
+    return {
+        "permutations": np.asarray(states.signals, int),
+        "sums": sums.astype(int),
+        "memory": final,
+        "right": np.all(np.asarray(states.right), axis=1, keepdims=False),
+        "signatures": signatures,
+        "masking costs": np.asarray(relevance.marginal_value),
+        "needed": np.array(needed, int),
+        "spread": np.array(max(spread)),
+        "predicts": np.array(len({x for x, _ in pairs}) == len(pairs)),
+    }

@@ -80,8 +80,10 @@ SEQUENCE_MARKS = (
     Mark("square", "c0", "an input: up is positive, down negative; faint: to be read"),
     Mark("line", "ink", "the answer, from −1 to 1"),
     Mark("square", "good", "pale: the side on which an answer is right; stronger where it counts"),
-    Mark("dot", "good", "an answer that counts and is right (✓ in the whole sequence)"),
-    Mark("dot", "bad", "one that is wrong (× in the whole sequence)"),
+    Mark("dot", "good", "an answer that counts and is right"),
+    Mark("dot", "bad", "an answer that counts and is wrong"),
+    Mark("tick", "good", "the same in the whole sequence: right"),
+    Mark("cross", "bad", "and wrong"),
     Mark("line", "muted", "now; in the whole sequence also what is shown above"),
 )
 

@@ -100,17 +100,25 @@ class ExtendedTMaze(AbstractEnvironment):
     action_size: ClassVar[int] = 1
 
     depth: int = eqx.field(static=True, default=2)  # junctions on the way, 1..24
-    robots: int = eqx.field(static=True, default=1)  # that learn, at least 1
+    robots: int = eqx.field(static=True, default=1)  # robots that learn, at least 1
     objective: Literal["converge", "spread"] = eqx.field(static=True, default="converge")
+    """The reward is observed if all robots are at it (converge) or one is (spread)."""
     partner: Literal["fsp", "resp"] | None = eqx.field(static=True, default="fsp")
-    corridor: tuple[int, int] = eqx.field(static=True, default=(2, 2))  # steps, at least 1
+    """Static robot: from the first endpoint up (fsp), drawn (resp), or None."""
+    corridor: tuple[int, int] = eqx.field(static=True, default=(2, 2))
+    """Steps between junctions, least and most, at least 1."""
     presence: Literal["others", "as-coded"] = eqx.field(static=True, default="others")
+    """Company: a robot at the same endpoint, or `as-coded` all at one."""
     feedback: Literal["objective", "own"] = eqx.field(static=True, default="objective")
+    """Reward that is seen: as the objective says, or at the own endpoint."""
     moves: Literal["uniform", "as-coded"] = eqx.field(static=True, default="uniform")
+    """Where the reward moves: to another endpoint, or `as-coded`."""
     rewards: tuple[str, ...] = eqx.field(static=True, default=("score",))
-    """Score and perhaps difference; the first is what training maximises."""
+    """Rewards by name: score and perhaps difference; the first is what training maximises."""
     counterfactual: Literal["absent", "random"] = eqx.field(static=True, default="absent")
+    """`difference` takes a robot out (absent), or moves it at random."""
     shaping: bool = eqx.field(static=True, default=False)
+    """Whether `shaped` is a reward too: score plus the author's bonuses."""
 
     def __check_init__(self):
         require.within("depth", self.depth, 1, DEEPEST)
@@ -261,21 +269,25 @@ class ExtendedTMaze(AbstractEnvironment):
             lengths = np.full((len(level), self.depth), self.corridor[0])
         long = lengths[np.arange(len(level)), np.clip(level, 0, self.depth - 1)]
         part = np.where(over, 1.0, 1.0 - state.distance / long)
-        trials = np.arange(self.trials)
+        goal, everybody = state.goals[0][np.arange(self.trials) >> self.depth], state.endpoint[ends]
+        partner = state.partner
+        if partner is not None:  # at the end of a trial it is already that of the next one
+            everybody = np.column_stack([everybody, partner[ends - 1]])
+        there = everybody == goal[:, None]
         shown = {
             "trial": state.trial - over,
             "level": level,
             "part": part.astype(np.float32),
             "turns": state.endpoint,
-            "goal": state.goals[0][trials >> self.depth],
+            "goal": goal,
             "endpoint": state.endpoint[ends],
-            "observed": trace.rewards["score"][ends - 1] > 0.0,
+            "observed": there.all(axis=1) if self.objective == "converge" else there.any(axis=1),
             "company": trace.observations[ends, :, 1] > 0.0,
             "reward": trace.observations[ends, :, 2] > 0.0,
         }
-        if state.partner is not None:  # at the end of a trial it is already that of the next one
-            shown["partner"] = state.partner[np.maximum(np.arange(len(level)) - over, 0)]
-            shown["static"] = state.partner[ends - 1]
+        if partner is not None:
+            before = np.maximum(np.arange(len(level)) - over, 0)
+            shown |= {"static": partner[ends - 1], "partner": partner[before]}
         return shown
 
     def _goals(self, key: PRNGKeyArray) -> Int[Array, " 3"]:

@@ -46,14 +46,16 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
     """By what name it is made."""
     api: ClassVar[str]  # whose interface it has: a key of adapters.APIS
     kwargs: tuple[tuple[str, Any], ...] = eqx.field(static=True, default=(), converter=_pairs)
-    max_episode_steps: int | None = eqx.field(static=True, default=None)  # None: its own
+    """What the task is made with, by name."""
+    max_episode_steps: int | None = eqx.field(static=True, default=None)
+    """Steps of an episode at most, at least 1; None: the task's own limit."""
     timeout: float = eqx.field(static=True, default=60.0)
-    """Seconds that one copy may take for a reset or a step."""
+    """Seconds that one copy may take for a reset or a step, above 0."""
     tolerated: float = eqx.field(static=True, default=0.1)
     """The share of the last 100 episodes that may fail, each with a return of NaN; if more do, and
     at least 3, `EnvironmentFailure` is raised. 0: the first one raises it."""
     at_once: int | None = eqx.field(static=True, default=None)
-    """Most copies that are open at the same time; None: as many as play together."""
+    """Most copies that are open at the same time, at least 1; None: as many as play together."""
     in_process: bool = eqx.field(static=True, default=False)
     """No worker. For debugging and for classes of a prompt: here nothing stops an environment
     that hangs, and one that crashes takes this process with it."""
@@ -210,6 +212,12 @@ class ForeignCopies(AbstractCopies):
                 raise UnfitEnvironment(f"{env.id} {fault.what}: {fault.fix}") from fault
             self._finalizer = weakref.finalize(self, self._backend.close, worker.GRACE)
         return self._backend
+
+    @property
+    def here(self) -> Any:
+        """The environment of the first copy, where it is played in this process, to draw it."""
+        backend = self._opened()
+        return backend._envs[0] if isinstance(backend, worker.Environments) else None
 
     @property
     def usable(self) -> bool:

@@ -57,7 +57,7 @@ REWARDS = ("global", "local", "mixed", "difference", "dpp")
 LEGEND = (
     Mark("arrow", "c0", "a rover, in its own colour, and its path so far"),
     Mark("ring", "muted", "activation distance of a POI, in as many arcs as rovers it needs"),
-    Mark("ring", "ink", "an arc is dark for each rover inside"),
+    Mark("ring", "ink", "an arc stands out for each rover inside"),
     Mark("rhombus", "ink", "POI that is not observed yet"),
     Mark("diamond", "bad", "observed POI, with the step in which it was"),
     Mark("line", "c0", "sensors, inner ring: other rovers"),
@@ -121,15 +121,19 @@ class Rover(AbstractEnvironment):
     `terminated` once all POIs are observed, `truncated` at `max_steps`.
     """
 
-    rovers: int | None = eqx.field(static=True, default=None)  # None: 2·coupling
-    pois: int = eqx.field(static=True, default=4)  # at least 1
-    coupling: int = eqx.field(static=True, default=3)  # rovers that a POI needs, 1..rovers
-    size: float = 20.0  # m, a side of the field
-    activation_distance: float = 3.0  # m, above 0
-    max_steps: int = eqx.field(static=True, default=50)  # steps of 1 s, at least 1
-    max_speed: float = 1.0  # m per step, above 0
-    harvest_period: int = eqx.field(static=True, default=1)  # consecutive steps, at least 1
-    poi_values: tuple[float, ...] | None = None  # one above 0 per POI; None: all 1
+    rovers: int | None = eqx.field(static=True, default=None)
+    """Agents, at least `coupling`; None: 2·coupling."""
+    pois: int = eqx.field(static=True, default=4)  # points of interest (POIs), at least 1
+    coupling: int = eqx.field(static=True, default=3)
+    """Rovers that must be near a POI at once to observe it, 1 to `rovers`."""
+    size: float = 20.0  # side of the field in metres, above 0
+    activation_distance: float = 3.0  # metres from which a POI is observed, above 0
+    max_steps: int = eqx.field(static=True, default=50)
+    """Length of an episode in steps of 1 s, at least 1."""
+    max_speed: float = 1.0  # metres per step, above 0
+    harvest_period: int = eqx.field(static=True, default=1)
+    """Consecutive steps that observing a POI takes, at least 1."""
+    poi_values: tuple[float, ...] | None = None  # value of each POI, above 0; None: all 1
     graded: bool = eqx.field(static=True, default=False)
     """An unobserved POI pays the share max over time of d_a / max(d_a, mean distance of the
     `coupling` closest rovers) of its value (d_a: `activation_distance`)."""
@@ -142,9 +146,14 @@ class Rover(AbstractEnvironment):
     the same, and to end the episode costs. progress: metres by which the step came closer to that
     one; nothing is lost by observing it."""
     rewards: tuple[str, ...] = eqx.field(static=True, default=("global", "local"))
+    """Rewards by name: global, local, mixed, difference, dpp; the first is what training
+    maximises."""
     mixed_weight: float = 10.0
+    """Weight of the global reward in `mixed`, which is local + weight · global."""
     observation: Literal["relative", "as-coded"] = eqx.field(static=True, default="relative")
+    """Sensors: `relative` to the heading, or `as-coded` by the author."""
     motion: Literal["as-written", "as-coded"] = eqx.field(static=True, default="as-written")
+    """Actions: turn and speed (`as-written`), or a turn at fixed speed."""
     start: Literal["continuous", "as-coded"] = eqx.field(static=True, default="continuous")
     """`"continuous"`: rovers uniform in the central square, POIs uniform outside it and 2 m or more
     from every rover, headings uniform. `"as-coded"`: integer cells, POIs left, right, and above or

@@ -38,8 +38,10 @@ class SequenceClassification(AbstractSequenceTask):
     inputs: ClassVar[tuple[str, ...]] = ("signal",)
 
     depth: int = eqx.field(static=True, default=21)  # signals per sequence, at least 1
-    min_gap: int = eqx.field(static=True, default=10)  # zeros between two signals, at least
-    max_gap: int = eqx.field(static=True, default=20)  # zeros between two signals, at most
+    min_gap: int = eqx.field(static=True, default=10)
+    """Zeros between two signals, at least, 0 or more."""
+    max_gap: int = eqx.field(static=True, default=20)
+    """Zeros between two signals, at most, `min_gap` or more."""
     ties: Literal["positive", "free"] = eqx.field(static=True, default="positive")
     """The right answer at a running sum of 0: +1, or anything."""
 

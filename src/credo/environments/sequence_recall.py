@@ -36,7 +36,8 @@ class SequenceRecall(AbstractSequenceTask):
 
     depth: int = eqx.field(static=True, default=6)  # directions and junctions, at least 1
     min_corridor: int = eqx.field(static=True, default=10)  # steps per corridor, at least 1
-    max_corridor: int = eqx.field(static=True, default=20)  # steps per corridor, at most
+    max_corridor: int = eqx.field(static=True, default=20)
+    """Steps per corridor, at most, `min_corridor` or more."""
     unit: int | None = eqx.field(static=True, default=None)
     """Steps per unit of distance; None: `max_corridor`, so that distances lie in [0, 1]."""
 

@@ -69,22 +69,27 @@ class ServerFleet(AbstractEnvironment):
 
     signals: ClassVar[tuple[str, ...]] = ("net",)
 
-    servers: int = eqx.field(static=True, default=10)  # at least 1
-    devices: int = eqx.field(static=True, default=20)  # at least 1
-    requests: int = eqx.field(static=True, default=5)  # pending per device at first, at least 1
+    servers: int = eqx.field(static=True, default=10)  # agents, at least 1
+    devices: int = eqx.field(static=True, default=20)  # devices that have requests, at least 1
+    requests: int = eqx.field(static=True, default=5)
+    """Pending requests of each device at first, at least 1."""
     nefarious: int | tuple[int, int] = eqx.field(static=True, default=(7, 13))
-    """How many devices: a number, or (least, most) to draw it from uniformly."""
+    """Number of nefarious devices, or (least, most) to draw it from uniformly, 0 to `devices`."""
     busy: int | tuple[int, int] = eqx.field(static=True, default=1)
     """Steps without acting behind each action: a number (1: "synchronous"), or (least, most) to
     draw it from uniformly for each action ((0, 2): "asynchronous")."""
-    max_steps: int = eqx.field(static=True, default=15)  # length of every episode, at least 1
+    max_steps: int = eqx.field(static=True, default=15)
+    """Length of every episode in steps, at least 1."""
     observation: Literal["signed one-hot", "scalar"] = eqx.field(
         static=True, default="signed one-hot"
     )
+    """How the worth of a served request is seen: at its device's place (signed one-hot), or as
+    one number."""
     told: Literal["once", "until-action"] = eqx.field(static=True, default="once")
     """How long the worth of a request is observed: one step (as coded; then a server that is busy
     must pay attention to learn it), or until the server acts again."""
-    status: bool = eqx.field(static=True, default=True)  # whether it is observed
+    status: bool = eqx.field(static=True, default=True)
+    """Whether a server sees if it acts, is busy or away."""
     scale: tuple[float, float] = eqx.field(static=True, default=(1.0, 1.0))
     """What the observed counts, and what a served request was worth, are multiplied by; both more
     than 0. Raw counts drown the worth: 20 devices with 5 requests each against one ±1."""

@@ -51,9 +51,10 @@ class SimpleSpread(AbstractEnvironment):
     signals: ClassVar[tuple[str, ...]] = ("global", "local")
     action_size: ClassVar[int] = 2
 
-    agents: int = eqx.field(static=True, default=3)  # and as many landmarks, at least 2
-    local_ratio: float = 0.5  # share of the agent's own collisions in its reward, 0..1
-    max_steps: int = eqx.field(static=True, default=25)  # length of every episode, at least 1
+    agents: int = eqx.field(static=True, default=3)  # agents and landmarks, at least 2 of each
+    local_ratio: float = 0.5  # share of an agent's own collisions in its reward, in [0, 1]
+    max_steps: int = eqx.field(static=True, default=25)
+    """Length of every episode in steps, at least 1."""
 
     def __check_init__(self):
         require.at_least("agents", self.agents, 2)

@@ -23,7 +23,7 @@ class Shortened(AbstractSequenceTask):
     the whole task, but what is cut off is not played.
     """
 
-    task: AbstractSequenceTask
+    task: AbstractSequenceTask  # the task that is cut short
     questions: Int[Array, ""] | int  # scored steps that are left, at least 1
 
     @property
@@ -96,7 +96,7 @@ class Given(AbstractSequenceTask):
 class AbstractWrapper(AbstractEnvironment):
     """A JAX task with the sizes and the signals of another one."""
 
-    env: AbstractEnvironment
+    env: AbstractEnvironment  # the wrapped task
 
     @property
     def obs_size(self) -> int:
@@ -224,7 +224,7 @@ class DelayedReward(AbstractWrapper):
 class DelayedHostReward(AbstractHostEnvironment):
     """The same for a task outside JAX. Its copies are those of `env`: play one at a time."""
 
-    env: AbstractHostEnvironment
+    env: AbstractHostEnvironment  # the task whose reward comes late
 
     def __check_init__(self):
         if not isinstance(self.env, AbstractHostEnvironment):

@@ -9,6 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .. import require, tree
+from ..networks.base import AbstractNetwork
+from ..networks.dmmu import DMMU
+from ..networks.team import Team
 from .crossover import AbstractCrossover
 from .mutation import AbstractMutation
 
@@ -70,6 +73,11 @@ def members(team: PyTree) -> tuple[PyTree, ...]:
             "Team(sharing='nothing'), or leave out the operators that exchange agents"
         )
     return own
+
+
+def apart(network: AbstractNetwork) -> bool:
+    """Whether each agent of a team has weights of its own."""
+    return isinstance(network, DMMU) or (isinstance(network, Team) and network.sharing == "nothing")
 
 
 def alike(team: PyTree, operator: str) -> tuple[PyTree, ...]:

@@ -1,5 +1,11 @@
 """Many runs, one process per core: on two cores, two single-threaded runs beat one that uses
-both. What is finished is not run again; what was stopped goes on."""
+both. What is finished is not run again; what was stopped goes on.
+
+A thread for each worker gives it one job after another over a pipe (see `worker`). A worker leads a
+process group of its own, so that whatever an environment starts ends with it: after its last job,
+after an error, after a second Ctrl-C, and when this process is killed. A worker that dies takes one
+job with it: that one is told, and a new worker takes the next.
+"""
 
 import contextlib
 import dataclasses
@@ -35,14 +41,22 @@ SAVE = 3600.0  # seconds that workers have to finish a generation and save, afte
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """One run, to be begun, or gone on with if its folder holds it already."""
+    """One run, to be begun, or gone on with if its folder holds it already.
+
+    - `algorithm`: an object, or the tree that `config.to_tree` makes of it.
+    - `options`: budget, checkpoints and loggers. Raises `ValueError` if it has callbacks, which are
+      objects of this process.
+    - `warm_start`: the run whose champion this one starts from; None: none.
+    - `again`: what `resume` is told of a run that exists (see `resumed`); None: a run as `train`
+      makes it.
+    """
 
     path: pathlib.Path
-    algorithm: Any  # an object, or the tree that `config.to_tree` makes of it
+    algorithm: Any
     seed: int
     options: RunOptions
-    warm_start: str | None = None  # the run whose champion this one starts from
-    again: dict[str, Any] | None = None  # what `resume` is told, of a run that exists
+    warm_start: str | None = None
+    again: dict[str, Any] | None = None
 
     def __post_init__(self):
         if self.options.callbacks:
@@ -117,6 +131,7 @@ class Job:
             )
 
     def _require_larger(self, run: Run, generation: int, frames: int) -> None:
+        """Raise if the run has done more than it is asked to do."""
         try:
             self.budget.refuse_smaller(Budget.read(run.config["budget"]), generation, frames)
         except ValueError as error:
@@ -146,12 +161,20 @@ class Job:
 
 @screen.calm()
 def run(jobs: Sequence[Job], workers: int | None = None, *, title: str = "runs") -> None:
-    """Train every unfinished job, one process per core or `workers` of them.
+    """Train every unfinished job.
 
-    Says which runs a limit of the clock left unfinished. Raises `RunError` with the failures after
-    all have been tried, `Interrupted` after a signal: the workers save first.
+    Says which runs a limit of the clock left unfinished, and how to go on with them.
+
+    **Arguments:** `workers`: processes at a time, at least 1; None: one per core that this process
+    may use. `title`: what stands before the line or bar that shows how far they are.
+
+    **Raises:** `RunError` if a folder holds another run, before anything is started, or with all
+    failures once every job was tried; `Interrupted` after a signal: the workers save first.
     """
     waiting = [job for job in jobs if not job.finished()]
+    for job in jobs:
+        if job.again and job not in waiting:
+            screen.say(f"{job.path} is finished: to go on give a larger --generations or --frames")
     if not waiting:
         return
     crew = _Crew(waiting, Board(title, len(jobs), len(waiting)))
@@ -254,6 +277,7 @@ class Board:
         self.left = ""
 
     def __enter__(self):
+        """Show the bar."""
         self.bar.start()
         return self
 
@@ -286,6 +310,7 @@ _processes: list[subprocess.Popen] = []
 
 
 def _start(core: int) -> subprocess.Popen:
+    """A worker that computes on this core alone."""
     process = subprocess.Popen(
         worker.command(core),
         stdin=subprocess.PIPE,
@@ -315,6 +340,7 @@ def _ask(process: subprocess.Popen, job: Job) -> dict[str, Any]:
 
 
 def _end(process: subprocess.Popen) -> None:
+    """Let a worker end, which it does when nothing more can come, and see to it."""
     assert process.stdin is not None
     assert process.stdout is not None
     with contextlib.suppress(BrokenPipeError):
@@ -355,6 +381,7 @@ def _pass_on(number: int) -> None:
 
 
 def _kill_all() -> None:
+    """End all workers of this process, of whichever `run` they are."""
     for process in list(_processes):
         _kill(process)
 

@@ -1,5 +1,9 @@
 """A process that trains one run after another: a job per line of JSON in, an answer per line out.
-Started by `local`; it ends when its input does."""
+
+It is started by `local` and ends when its input does, or with its parent. A job is what
+`Job.message` says; an answer is `{"ok": path}`, or `{"error": words}` with which the process goes
+on. On Linux it computes on one core; what is printed goes to stderr.
+"""
 
 import contextlib
 import ctypes
@@ -48,6 +52,7 @@ def _ask_for_death(parent: int) -> None:
 
 
 def main(core: int) -> None:
+    """Take jobs until there are none. Ends with 128 + n after signal n, saved."""
     if hasattr(os, "sched_setaffinity"):  # not on macOS
         os.sched_setaffinity(0, {core})  # before JAX counts its threads
     parent = os.getppid()
@@ -81,6 +86,7 @@ def main(core: int) -> None:
 
 
 def _train(job: dict[str, Any]) -> None:
+    """Begin a run, or go on with the one in its folder."""
     from ..runs import config, loop, options, record
 
     path, told = pathlib.Path(job["path"]), options.RunOptions.read(job["options"])

@@ -1,131 +1,80 @@
 """What made the difference: our settings for 21-deep classification, less one ingredient each."""
 
-import dataclasses
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
-import numpy as np
 
-from ..algorithms.neuroevolution import Neuroevolution
-from ..analysis import counting
-from ..evolution.curriculum import Curriculum
-from ..report.sections import Curve, Figure, Reference, Table
-from ..runs.store import Run
-from . import chapter3
-from .base import Cell
+from ..analysis.generalization import first_mistakes
+from ..environments.curriculum import Curriculum
+from ..report.rows import Row, rows
+from .base import Cell, Experiment, Trained
+from .dissertation import told
+from .fig_3_4a import TEST, deepest, learned, learning, rounded
+from .table_3_2 import streams, to_the_end
+from .views import Table, constant, mean, median
 
-TITLE = "our settings less one ingredient, 21-deep Sequence Classification"
-PUBLISHED = (
-    "Not in the dissertation, which reports 87.6 ± 6.85 % at depth 21 and 50.4 ± 9.3 % at depth "
-    "101. All rows have the same budget of network evaluations."
-)
 STREAM = {"smoke": 1_000, "quick": 10_000, "full": 100_000}
-
-
-def _without(change: Callable[[Any], dict[str, Any]]) -> Callable[[Any], Neuroevolution]:
-    return lambda ours: dataclasses.replace(ours, **change(ours))
-
-
-INGREDIENTS = {
-    "ours": _without(lambda ours: {}),
-    "without saturated start": _without(
-        lambda ours: {"network": dataclasses.replace(ours.network, start_weights="drawn")}
-    ),
-    "without curriculum": _without(
-        lambda ours: {"curriculum": dataclasses.replace(ours.curriculum, start=ours.env.depth)}
-    ),
-    "without persistent signals": _without(lambda ours: {"curriculum": Curriculum()}),
-    "with the author's fitness": _without(lambda ours: {"fitness": ()}),
-    "without parsimony": _without(lambda ours: {"parsimony": None}),
-    "without erasing": _without(
-        lambda ours: {"mutation": dataclasses.replace(ours.mutation, reset_probability=0.0)}
-    ),
-    "without limit": _without(
-        lambda ours: {"mutation": dataclasses.replace(ours.mutation, limit=1e12)}
-    ),
-    "with elite memory of 6": _without(lambda ours: {"elite_memory": 6}),
-    "without crossover": _without(lambda ours: {"cross_repeated": False}),
+INGREDIENTS: dict[str, Callable[[Any], dict[str, Any]]] = {  # fields of our algorithm that change
+    "without saturated start": lambda x: {"network": replace(x.network, start_weights="drawn")},
+    "without curriculum": lambda x: {"curriculum": replace(x.curriculum, start=x.env.depth)},
+    "without persistent signals": lambda x: {"curriculum": Curriculum()},
+    "with the author's fitness": lambda x: {"fitness": ()},
+    "without parsimony": lambda x: {"parsimony": None},
+    "without erasing": lambda x: {"mutation": replace(x.mutation, reset_probability=0.0)},
+    "without limit": lambda x: {"mutation": replace(x.mutation, limit=1e12)},
+    "with elite memory of 6": lambda x: {"elite_memory": 6},
+    "without crossover": lambda x: {"cross_repeated": False},
 }
 
 
 def cells(budget: str) -> list[Cell]:
-    (full,) = chapter3.deepest_cells(budget)
-    runs = max(full.runs // 2, 2)
-    return [
-        full
-        if name == "ours"
-        else Cell(
-            f"{full.name} {name}",
-            change(full.algorithm),
-            full.generations,
-            runs,
-            full.first_seed,
-        )
-        for name, change in INGREDIENTS.items()
-    ]
+    """Ours, and with each change half as many runs."""
+    (ours,) = deepest(budget)
+    seeds = ours.seeds[: max(len(ours.seeds) // 2, 2)]
+
+    def changed(name: str, fields: dict[str, Any]) -> Cell:
+        algorithm = replace(ours.algorithm, **fields)
+        return Cell({**ours.labels, "change": name}, algorithm, seeds, ours.generations)
+
+    return [ours, *(changed(name, f(ours.algorithm)) for name, f in INGREDIENTS.items())]
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    measured = {}
-    for name, cell in runs.items():
-        policies = chapter3.champions(cell)
-        lengths = chapter3.first_mistakes(policies, 101, seed=40_000)
-        depth = cell[0].algorithm.env.depth
-        far = counting.longest_correct(policies, STREAM[budget], 4, key=jax.random.key(60_000))
-        measured[name] = {
-            "depth": depth,
-            "success": chapter3.rounded((lengths >= depth).mean(axis=1)),
-            "success at 101": chapter3.rounded((lengths >= 101).mean(axis=1)),
-            "stream": STREAM[budget],
-            "signals right": np.asarray(far).min(axis=1).tolist(),
-            "curve": chapter3.curves(cell),
-        }
-    return measured
+def measure(trained: Trained) -> list[Row]:
+    """Success at the depth of training and at 101, and the shortest of four long streams."""
+    far = first_mistakes(trained.champions, 101, TEST, key=jax.random.key(40_000))
+    fed, axes = STREAM[trained.budget], {"labels": trained.labels, "seed": trained.seeds}
+    found = [Row(trained.labels, None, "signals fed", fed)]
+    for metric, depth in (("success", trained.env.depth), ("success at depth 101", 101)):
+        found += rows(metric, rounded((far >= depth).mean(axis=1)), **axes)
+    right: dict[int | None, list[int]] = {}
+    for row in streams(trained, fed, 4):
+        right.setdefault(row.seed, []).append(row.value)
+    return found + rows("signals right", [min(x) for x in right.values()], **axes)
 
 
-def _change(name: str) -> str:
-    """What a cell of this name does without."""
-    return name.partition(" ours")[2].strip() or "ours"
-
-
-def sections(measured: dict[str, Any]) -> list[Any]:
-    rows = [
-        [
-            _change(name),
-            chapter3.percent(cell["success"]),
-            chapter3.spread(cell["success"]),
-            chapter3.percent(cell["success at 101"]),
-            f"{sum(n >= cell['stream'] for n in cell['signals right'])} of "
-            f"{len(cell['signals right'])}",
-        ]
-        for name, cell in measured.items()
-    ]
-    first = next(iter(measured.values()))
-    return [
-        Table(
-            "Final champions, in percent: mean ± standard error over runs",
-            [
-                "settings",
-                f"depth {first['depth']}",
-                "median (range)",
-                "depth 101",
-                f"right on 4 streams of {first['stream']:,} signals",
-            ],
-            rows,
-            caption="Rows but the first have half as many runs. 1,000 fresh sequences for the "
-            "depths. Erasing and the limit make the weights that parsimony rewards: without them "
-            "it does little; beside the author's fitness, in the hundreds, its 0.3 does nothing.",
-        ),
-        Figure(
-            "Champion of each generation, moving average over 100",
-            "generation",
-            "success, 50 fresh sequences",
-            [
-                Curve(_change(name), cell["curve"]["generation"], cell["curve"]["smoothed"])
-                for name, cell in measured.items()
-            ],
-            references=(Reference("published", 0.876),),
-            y_range=(0.0, 1.02),
-        ),
-    ]
+TABLE = Table(
+    "Final champions: success, %",
+    rows=("preset", "change", "depth"),
+    columns={
+        "at this depth": mean("success", 100, 1),
+        "median (range)": median("success", 100),
+        "depth 101": mean("success at depth 101", 100, 1),
+        "right on 4 streams of 100,000 signals (10,000 at quick)": to_the_end,
+    },
+    caption="Rows but the first have half as many runs. 1,000 fresh sequences for the depths. "
+    "Erasing and the limit make the weights that parsimony rewards: without them it does little; "
+    "beside the author's fitness, in the hundreds, its 0.3 does nothing.",
+)
+CURVES = learned(
+    y="test success, smoothed",
+    x="generation",
+    line=("preset", "change"),
+    title="Champion of each generation, moving average over 100",
+    y_label="success, 50 fresh sequences",
+    levels={"published": constant(0.876)},
+)
+EXPERIMENT = Experiment(
+    **told("ablation-3.4a"), cells=cells, measures=(measure, learning), views=(TABLE, CURVES)
+)

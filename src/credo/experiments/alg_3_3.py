@@ -1,72 +1,64 @@
 """Algorithm 3: what each memory cell of a champion does, cell by cell."""
 
-import dataclasses
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
 
 import jax
 
-from .. import tree
 from ..analysis import memory
 from ..environments.sequence_classification import SequenceClassification
-from ..report.sections import Table, Text
-from ..runs.store import Run
-from . import chapter3
-from .base import Cell
+from ..report import sections as page
+from ..report.rows import Results, Row
+from .base import Experiment, Trained, Value
+from .dissertation import told
+from .fig_3_4a import deepest
+from .table_3_1 import best_seed, of_best, signals_right
+from .views import Runs, Table, each
 
-TITLE = "the pseudo-algorithm a champion runs"
-PUBLISHED = (
-    "Algorithm 3 of the dissertation: at -1, M3 gains about 1; at +1, M5 loses about 1; otherwise "
-    "memory is not updated; the class is a function of M2, M3 and M5."
-)
+METRICS = {  # of `memory.CellRole`
+    "plus": "move at +1",
+    "minus": "move at -1",
+    "distractor": "move at a distractor",
+    "drift": "drift between signals",
+    "plus_share": "share of +1 at which it moves",
+    "minus_share": "share of -1 at which it moves",
+    "role": "role",
+}
 
 
-def cells(budget: str) -> list[Cell]:
-    return chapter3.deepest_cells(budget)
-
-
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    ((name, cell),) = runs.items()
-    policies = chapter3.champions(cell)
-    chosen, lengths = chapter3.best(policies)
+def roles(trained: Trained) -> Iterator[Row]:
+    """Mean moves of each cell of each champion in 50 sequences, and what they amount to; of the
+    best one the whole algorithm as text."""
+    best, *lengths = signals_right(trained)
     task, key = SequenceClassification(depth=21), jax.random.key(70_000)
-    found = [
-        memory.pseudo_algorithm(tree.take(policies, i), task, key=key) for i in range(len(cell))
-    ]
-    return {
-        "cell": name,
-        "champion": chosen,
-        "signals right": chapter3.rounded(lengths, 1),
-        "algorithm": memory.describe(found[chosen]),
-        "roles": [[dataclasses.asdict(role) for role in roles] for roles in found],
-    }
+    found = [memory.pseudo_algorithm(run.champion, task, key=key) for run in trained.runs]
+    text = memory.describe(found[best.value])
+    yield from (best, *lengths, Row(trained.labels, None, "algorithm", text))
+    for seed, cells in zip(trained.seeds, found, strict=True):
+        for role in cells:
+            labels = {**trained.labels, "cell": f"M{role.cell + 1}"}
+            yield from (Row(labels, seed, METRICS[k], getattr(role, k)) for k in METRICS)
 
 
-def sections(measured: dict[str, Any]) -> list[Any]:
-    best = measured["roles"][measured["champion"]]
-    return [
-        Text(f"Run {measured['champion']}", measured["algorithm"].split("\n")),
-        Table(
-            "Its cells: mean move per step",
-            ["cell", "at +1", "at -1", "at a distractor", "role"],
-            [
-                [
-                    f"M{r['cell'] + 1}",
-                    f"{r['plus']:+.3f}",
-                    f"{r['minus']:+.3f}",
-                    f"{r['distractor']:+.2g}",
-                    r["role"],
-                ]
-                for r in best
-            ],
-        ),
-        Table(
-            "Every run",
-            ["run", "random signals right in a row", *(f"M{r['cell'] + 1}" for r in best)],
-            [
-                [str(i), f"{length:.0f}", *(r["role"] for r in roles)]
-                for i, (roles, length) in enumerate(
-                    zip(measured["roles"], measured["signals right"], strict=True)
-                )
-            ],
-        ),
-    ]
+def algorithm(results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
+    """The pseudo-algorithm of the best run."""
+    yield page.Text(f"Seed {best_seed(results)}", results.value("algorithm").split("\n"))
+
+
+COLUMNS = {
+    "at +1": each("move at +1", form="+.3f"),
+    "at -1": each("move at -1", form="+.3f"),
+    "at a distractor": each("move at a distractor", form="+.2g"),
+    "role": each("role", form=""),
+}
+RUNS = {"random signals right in a row": each("signals right", form=".0f")}
+RUNS |= {cell: each("role", form="", cell=cell) for cell in ("M1", "M2", "M3", "M4", "M5")}
+EXPERIMENT = Experiment(
+    **told("alg-3.3"),
+    cells=deepest,
+    measures=(roles,),
+    views=(
+        algorithm,
+        of_best(Table("Its cells: mean move per step", rows=("cell",), columns=COLUMNS)),
+        Runs("Every run", RUNS),
+    ),
+)

@@ -1,103 +1,202 @@
-"""What every experiment shares: cells of runs, budgets, the folder of results."""
+"""An experiment is data: cells of runs, what is measured of them, and how rows are shown.
 
-import dataclasses
+A module of this folder defines one figure or table as `EXPERIMENT`; `catalogue` has its id and its
+title. A cell has labels, an algorithm, a budget and seeds; its name and folder are made of its
+labels, and nothing is ever read back from a name. What is measured are rows
+(`credo.report.rows`), a figure is a view of rows (`views`). A whole module:
+
+    '''Figure 9.1: TD3 and ERL on a pendulum, at two sizes of their networks.'''
+
+    from ..algorithms.erl import ERL
+    from ..algorithms.off_policy import OffPolicy
+    from ..environments.gymnasium import Gymnasium
+    from ..networks.mlp import MLP
+    from . import measures
+    from .base import Cell, Experiment, Value, grid
+    from .views import Curves, Table, known, mean, published
+
+    METHODS = {"td3": OffPolicy.td3, "erl": ERL.erl}
+    FRAMES = {"smoke": 2_000, "quick": 20_000, "full": 200_000}
+
+
+    def cells(budget: str) -> list[Cell]:
+        return [
+            Cell(x, METHODS[x["method"]](Gymnasium("Pendulum-v1"), MLP(hidden=(x["width"],))),
+                 seeds=range(3), frames=FRAMES[budget])
+            for x in grid(method=METHODS, width=(16, 64))
+        ]
+
+
+    EXPERIMENT = Experiment(
+        published="Figure 9.1: ERL is better at either size.",
+        cells=cells,
+        measures=(measures.final(), measures.scores(), measures.of_task(measures.random_actions)),
+        views=(
+            Curves("test score", "frames", line=["method"], panel=["width"]),
+            Table("Return", ["width", "method"], {"random": known("random"),
+                  "published": published("return"), "final champion": mean("return")}),
+        ),
+        values=(Value(-150.0, "return", "its text", {"method": "erl", "width": 64}),),
+    )
+"""
+
 import importlib
+import itertools
 import json
 import pathlib
 import re
 import shlex
 import sys
-from collections.abc import Iterable
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
-import equinox as eqx
+from jaxtyping import PyTree
 
+from .. import tree
 from ..executors import local
-from ..report.pages import write
-from ..report.sections import Page
-from ..runs import config, files
+from ..report.pages import write as write_page
+from ..report.rows import Label, Labels, Results, Row, Series, concat, read, write
+from ..report.sections import Page, Section
+from ..runs import config, log
 from ..runs.options import RunOptions
 from ..runs.record import RunError
 from ..runs.store import Run
+from . import catalogue
 
-MODULES = {
-    "fig-3.4a": "fig_3_4a",
-    "fig-3.4b": "fig_3_4b",
-    "fig-3.5a": "fig_3_5a",
-    "fig-3.5b": "fig_3_5b",
-    "table-3.1": "table_3_1",
-    "table-3.2": "table_3_2",
-    "fig-3.6": "fig_3_6",
-    "fig-3.7": "fig_3_7",
-    "alg-3.3": "alg_3_3",
-    "fig-3.9a": "fig_3_9a",
-    "fig-3.9b": "fig_3_9b",
-    "fig-3.10": "fig_3_10",
-    "fig-3.11": "fig_3_11",
-    "fig-3.12": "fig_3_12",
-    "fig-3.13": "fig_3_13",
-    "beyond-3": "beyond_3",
-    "ablation-3.4a": "ablation_3_4a",
-    "fig-4.2": "fig_4_2",
-    "fig-4.3": "fig_4_3",
-    "fig-4.4": "fig_4_4",
-    "fig-4.7": "fig_4_7",
-    "fig-4.8": "fig_4_8",
-    "table-4.1": "table_4_1",
-    "beyond-4": "beyond_4",
-    "check-td3": "check_td3",
-    "check-learners": "check_learners",
-    "fig-5.2": "fig_5_2",
-    "fig-5.3": "fig_5_3",
-    "fig-5.4": "fig_5_4",
-    "table-5.2": "table_5_2",
-    "note-5.5": "note_5_5",
-    "beyond-5": "beyond_5",
-    "fig-6.2": "fig_6_2",
-    "fig-6.3": "fig_6_3",
-    "fig-6.4": "fig_6_4",
-    "fig-6.5": "fig_6_5",
-    "table-6.1": "table_6_1",
-    "beyond-6": "beyond_6",
-    "fig-7.1": "fig_7_1",
-    "fig-7.4": "fig_7_4",
-    "fig-7.5": "fig_7_5",
-    "beyond-7": "beyond_7",
-    "check-spread": "check_spread",
-}
-BUDGETS = ("smoke", "quick", "full")  # a module may define more, as a name of the same
+BUDGETS = ("smoke", "quick", "full")  # seconds, minutes, hours
 
 
-class Cell(eqx.Module):
-    """Independent runs of one algorithm that differ in their seed alone."""
+@dataclass(frozen=True)
+class Cell:
+    """Independent runs of one algorithm that differ in their seed alone.
 
-    name: str  # also the folder of its runs: experiments that share a cell share its runs
+    `labels`: what sets it apart from the other cells: `{"method": "merl", "coupling": 4}`. Settings
+    chosen by looking at some seeds are reported on others: `seeds`. A run ends at `generations`,
+    `frames` (environment steps) or a champion's score of `stop_at`, whichever comes first.
+    """
+
+    labels: Labels
     algorithm: Any
-    generations: int | None  # budget of each run; None: frames alone limit it
-    runs: int
-    first_seed: int = 0  # settings chosen by looking at some seeds are reported on others
-    frames: int | None = None  # budget of each run, in environment steps
-    stop_at: float | None = None  # a run ends early once its champion's score reaches this
+    seeds: Sequence[int]
+    generations: int | None = None
+    frames: int | None = None
+    stop_at: float | None = None
+
+    @property
+    def name(self) -> str:
+        """What a reader sees, and `--only` looks at: "merl, coupling 4". Also the folder of its
+        runs: experiments that share a cell share its runs."""
+        return named(self.labels)
+
+    @property
+    def folder(self) -> str:
+        return self.name.replace("/", "-")
+
+    @property
+    def budget(self) -> dict[str, Any]:
+        """What ends a run, by the names of `RunOptions`."""
+        limits = {"generations": self.generations, "frames": self.frames, "stop_at": self.stop_at}
+        return {name: limit for name, limit in limits.items() if limit is not None}
+
+    def record(self) -> dict[str, Any]:
+        """As `results.json` has it."""
+        algorithm = json.loads(json.dumps(config.to_tree(self.algorithm)))
+        told = {"labels": dict(self.labels), "seeds": list(self.seeds), "budget": self.budget}
+        return told | {"algorithm": algorithm}
 
 
-class Experiment(Protocol):
-    """What a module of this folder defines."""
+@dataclass(frozen=True)
+class Trained:
+    """A cell whose runs are done: what measurements look at."""
 
-    TITLE: str
-    PUBLISHED: str  # where the dissertation has it
+    cell: Cell
+    runs: list[Run]
+    budget: str
 
-    def cells(self, budget: str) -> list[Cell]:
-        """The runs it needs. `budget`: smoke (seconds), quick (minutes), full, or one of its own
-        `BUDGETS`."""
-        ...
+    @property
+    def labels(self) -> Labels:
+        return self.cell.labels
 
-    def measure(self, runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-        """Plain numbers, per seed, from the runs of every cell."""
-        ...
+    @property
+    def seeds(self) -> list[int]:
+        return list(self.cell.seeds)
 
-    def sections(self, results: dict[str, Any]) -> list[Any]:
-        """Figures and tables of the page, from `measure`'s numbers alone."""
-        ...
+    @property
+    def env(self) -> Any:
+        return self.cell.algorithm.env
+
+    @cached_property
+    def champions(self) -> PyTree:
+        """The final champions as one population `[runs, …]`."""
+        return tree.stack(*(run.champion for run in self.runs))
+
+    def record(self) -> dict[str, Any]:
+        """The cell as `results.json` has it, with the core-hours that its runs took."""
+        clocks = [log.read(run.path / log.TIMING) for run in self.runs]
+        hours = sum(float(clock["seconds"][-1]) for clock in clocks if clock) / 3600
+        return self.cell.record() | {"machine": config.machine(), "hours": round(hours, 2)}
+
+
+Measure = Callable[[Trained], Iterable[Row | Series]]
+
+
+@dataclass(frozen=True)
+class Value:
+    """A published number (or its words: "> 80"), and where it stands. It belongs to every row
+    that has these labels. `spread`: what stands behind the number: "± 512"."""
+
+    value: float | str
+    metric: str
+    source: str
+    labels: Labels = field(default_factory=dict)
+    spread: str = ""
+
+
+View = Section | Callable[[Results, Sequence[Value]], Iterable[Section]]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A figure or table, as data.
+
+    `published`: what the dissertation has, and where. `cells(budget)`: the runs it needs.
+    `measures`: rows of each cell. `views`: sections of the page, in order; a view without rows is
+    left out. `values`: published numbers.
+    """
+
+    published: str
+    cells: Callable[[str], list[Cell]]
+    measures: Sequence[Measure]
+    views: Sequence[View]
+    values: Sequence[Value] = ()
+    budgets: Sequence[str] = BUDGETS
+
+
+def named(labels: Labels) -> str:
+    """Labels in words: words as they are, numbers behind the name of their label, of truths the
+    name alone: "merl, coupling 4, delayed"."""
+
+    def words(name: str, value: Label) -> str:
+        if isinstance(value, str) or value is True:
+            return name if value is True else value
+        return f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
+
+    return ", ".join(words(name, x) for name, x in labels.items() if x is not False)
+
+
+def grid(**axes: Iterable[Label]) -> list[dict[str, Label]]:
+    """Labels of every combination, the first axis slowest."""
+    return [dict(zip(axes, found, strict=True)) for found in itertools.product(*axes.values())]
+
+
+def find(name: str) -> Experiment:
+    """The experiment of an id of the catalogue."""
+    return importlib.import_module(f".{catalogue.module(name)}", __package__).EXPERIMENT
+
+
+# ------------------------------------------------------------------------------------ reproduce
 
 
 def reproduce(
@@ -113,64 +212,56 @@ def reproduce(
     """Run what is missing, measure, and write `results.json` and `report.html`.
 
     **Arguments:** `runs`: of each cell, instead of what the budget says. `only`: leave out cells in
-    whose name this regular expression is not found, in whatever case: "(erl|ddpg) Hopper". What
-    earlier commands measured of the others stays, where its settings are today's.
+    whose name this regular expression is not found, in whatever case: "(erl|ddpg), Hopper". What
+    earlier commands measured of the others stays, where its settings are today's. `jobs`: runs at
+    a time; None: one per core.
 
     **Returns:** the path of the page. **Raises:** `RunError` if there is no such budget or cell.
     """
-    module: Any = importlib.import_module(f".{MODULES[name]}", __package__)
-    if budget not in (known := budgets(name)):
-        raise RunError(f"{name} has no budget {budget!r}: it has {', '.join(known)}")
-    every = module.cells(budget)
-    cells = every if only is None else named(every, only, f"{name} at budget {budget}")
+    experiment = find(name)
+    if budget not in experiment.budgets:
+        raise RunError(f"{name} has no budget {budget!r}: it has {', '.join(experiment.budgets)}")
+    every = experiment.cells(budget)
+    chosen = every if only is None else matching(every, only, f"{name} at budget {budget}")
     if runs is not None:
-        cells = [dataclasses.replace(cell, runs=runs) for cell in cells]
+        chosen = [replace(c, seeds=range(c.seeds[0], c.seeds[0] + runs)) for c in chosen]
     target = output / name / budget / "results.json"
-    earlier = None if only is None else kept(target, every, cells)
-    folder = {
-        cell.name: [work / budget / cell.name / str(s) for s in seeds(cell)] for cell in cells
-    }
-    local.run(
-        [
-            local.Job(path, cell.algorithm, seed, RunOptions(tensorboard=False, **limits(cell)))
-            for cell in cells
-            for seed, path in zip(seeds(cell), folder[cell.name], strict=True)
-        ],
-        jobs,
-        title=f"{name} {budget}",
-    )
+    earlier = None if only is None else kept(target, every, chosen)
+    finished = trained(chosen, budget, work / budget, jobs, f"{name} {budget}")
     print(f"{name} {budget}: runs are done; measuring", file=sys.stderr)
-    finished = {name: [Run(path) for path in paths] for name, paths in folder.items()}
-    results = {
-        "experiment": name,
-        "budget": budget,
-        "command": f"credo reproduce {name} --budget {budget}"
-        + (f" --runs {runs}" if runs is not None else "")
-        + (f" --only {shlex.quote(only)}" if only is not None else ""),
-        "cells": {
-            cell.name: {
-                "runs": cell.runs,
-                "first seed": cell.first_seed,
-                **{name: limit for name, limit in limits(cell).items() if limit is not None},
-                "algorithm": config.to_tree(cell.algorithm),
-            }
-            for cell in cells
-        },
-        "machine": config.machine(),
-        "measured": module.measure(finished, budget),
-    }
-    if earlier is not None:
-        results = merged(earlier, results, every)
-    files.write_text(target, _compact(results))
+    flags = {"--budget": budget, "--runs": runs, "--only": only}
+    told = [f"{x} {shlex.quote(str(given))}" for x, given in flags.items() if given is not None]
+    command = " ".join([f"credo reproduce {name}", *told])
+    found, curves = concat(m(cell) for cell in finished for m in experiment.measures)
+    records = [cell.record() for cell in finished]
+    results = Results(name, budget, command, records, found, curves)
+    write(results if earlier is None else merged(earlier, results, every), target)
     return page(target)
 
 
-def named(cells: list[Cell], only: str, where: str) -> list[Cell]:
+def trained(
+    cells: list[Cell], budget: str, work: pathlib.Path, jobs: int | None, title: str
+) -> list[Trained]:
+    """The cells with their runs, in folders of `work`; what is missing of them is trained."""
+    paths = [[work / cell.folder / str(seed) for seed in cell.seeds] for cell in cells]
+    wanted = [
+        local.Job(path, cell.algorithm, seed, RunOptions(**cell.budget, tensorboard=False))
+        for cell, folders in zip(cells, paths, strict=True)
+        for seed, path in zip(cell.seeds, folders, strict=True)
+    ]
+    local.run(wanted, jobs, title=title)
+    return [
+        Trained(cell, [Run(path) for path in folders], budget)
+        for cell, folders in zip(cells, paths, strict=True)
+    ]
+
+
+def matching(cells: list[Cell], only: str, where: str) -> list[Cell]:
     """Those in whose name the regular expression is found; RunError if there are none."""
     try:
         pattern = re.compile(only, re.IGNORECASE)
     except re.error as error:
-        raise RunError(f"only is {only!r}, no regular expression: {error}") from error
+        raise RunError(f"--only {only!r} is no regular expression: {error}") from error
     found = [cell for cell in cells if pattern.search(cell.name)]
     if not found:
         names = "; ".join(cell.name for cell in cells)
@@ -178,150 +269,126 @@ def named(cells: list[Cell], only: str, where: str) -> list[Cell]:
     return found
 
 
-def kept(path: pathlib.Path, cells: list[Cell], chosen: list[Cell]) -> dict[str, Any] | None:
+def kept(path: pathlib.Path, every: list[Cell], chosen: list[Cell]) -> Results | None:
     """What was measured earlier of cells that are not `chosen` now, if today's runs of them would
     be the same (their number may differ; versions of Credo may too). Says what stays and what does
     not, and why."""
     if not path.exists():
         return None
     try:
-        record = json.loads(files.read_text(path))
-        measured, recorded, machine, _ = (
-            record[name] for name in ("measured", "cells", "machine", "command")
-        )
-    except (ValueError, KeyError) as error:
+        earlier = read(path)
+    except ValueError as error:
         raise RunError(
-            f"{path} is no record of results ({error!r}): move it away, or choose another --output"
+            f"{error}: convert it by tools/convert_results.py if an older version of Credo wrote "
+            "it; otherwise move it away, or choose another --output"
         ) from error
-    others = [name for name in recorded if name not in {cell.name for cell in chosen}]
-    known = {cell.name: cell for cell in cells}
-    stay = []
-    for name in others:
-        why = _other_runs(recorded[name], known.get(name))
-        if measured.keys() != recorded.keys():
-            why = ["numbers of this experiment are of all its cells together"]
-        if why:
-            print(f"not kept of {path}: {name} ({'; '.join(why)})", file=sys.stderr)
-        else:
-            stay.append(name)
+    now, known = {cell.name for cell in chosen}, {cell.name: cell for cell in every}
+    others = {named(x["labels"]): x for x in earlier.cells if named(x["labels"]) not in now}
+    why = {name: _other_runs(record, known.get(name)) for name, record in others.items()}
+    for name, lines in why.items():
+        if lines:
+            print(f"not kept of {path}: {name} ({'; '.join(lines)})", file=sys.stderr)
+    stay = {name: record for name, record in others.items() if not why[name]}
     if not stay:
         return None
     print(f"kept of {path}: {'; '.join(stay)}", file=sys.stderr)
-    found = {name: {"machine": machine} | recorded[name] for name in stay}
-    return record | {"cells": found, "measured": {name: measured[name] for name in stay}}
+    return _of_cells(earlier, list(stay.values()))
 
 
-def merged(earlier: dict[str, Any], results: dict[str, Any], cells: list[Cell]) -> dict[str, Any]:
-    """Results of two commands, in the order of `cells`. A cell names its machine if that is not
-    the last command's."""
-    here = results["machine"]
-    old = {
-        name: {key: value for key, value in cell.items() if (key, value) != ("machine", here)}
-        for name, cell in earlier["cells"].items()
-    }
-    both = {"cells": old | results["cells"], "measured": earlier["measured"] | results["measured"]}
-    order = [cell.name for cell in cells if cell.name in both["cells"]]
-    now = results["command"]
-    before = [command for command in earlier["command"].split(" && ") if command != now]
-    return (
-        results
-        | {"command": " && ".join([*before, now])}
-        | {key: {name: value[name] for name in order} for key, value in both.items()}
-    )
-
-
-def _other_runs(record: dict[str, Any], cell: Cell | None) -> list[str]:
+def _other_runs(record: Mapping[str, Any], cell: Cell | None) -> list[str]:
     """How the runs of a recorded cell differ from today's."""
     if cell is None:
         return ["there is no such cell today"]
-    today = json.loads(json.dumps(config.to_tree(cell.algorithm)))
+    today = cell.record()
     try:
-        lines = config.changed(record["algorithm"], today)
+        lines = config.changed(record["algorithm"], today["algorithm"])
     except (KeyError, TypeError, ValueError) as error:
         return [f"its record cannot be read: {error}"]
-    given = {name: limit for name, limit in limits(cell).items() if limit is not None}
-    given |= {"first seed": cell.first_seed}
-    known = {k: v for k, v in record.items() if k not in ("runs", "algorithm", "machine")}
-    return config.differences(known, given) + lines
+    if record["seeds"][0] != cell.seeds[0]:
+        lines.append(f"first seed: {record['seeds'][0]} != {cell.seeds[0]}")
+    return config.differences(record["budget"], today["budget"]) + lines
 
 
-def budgets(name: str) -> tuple[str, ...]:
-    """The budgets that an experiment can be run at."""
-    module: Any = importlib.import_module(f".{MODULES[name]}", __package__)
-    return getattr(module, "BUDGETS", BUDGETS)
+def _of_cells(results: Results, cells: Sequence[Mapping[str, Any]]) -> Results:
+    """Only rows and curves of these cells: those whose labels, as far as cells have them, agree."""
+    names = {name for cell in results.cells for name in cell["labels"]}
 
+    def key(labels: Labels) -> frozenset[tuple[str, Any]]:
+        return frozenset((name, value) for name, value in labels.items() if name in names)
 
-def limits(cell: Cell) -> dict[str, Any]:
-    """What ends a run of this cell, by the names of `RunOptions`."""
-    return {"generations": cell.generations, "frames": cell.frames, "stop_at": cell.stop_at}
-
-
-def seeds(cell: Cell) -> range:
-    return range(cell.first_seed, cell.first_seed + cell.runs)
-
-
-def page(results: pathlib.Path) -> pathlib.Path:
-    """Write `report.html` beside a `results.json`, from its numbers alone."""
-    record = json.loads(files.read_text(results))
-    module: Any = importlib.import_module(f".{MODULES[record['experiment']]}", __package__)
-    cells = record["cells"]
-    machines = [
-        record["machine"],
-        *(cell["machine"] for cell in cells.values() if "machine" in cell),
-    ]
-    facts = {
-        "budget": record["budget"],
-        "runs": ", ".join(
-            f"{name}: {cell['runs']} × {extent(cell)}" for name, cell in cells.items()
-        ),
-        "machine": _once(f"{m['processor']}, {m['device']}, {m['system']}" for m in machines),
-        "versions": _once(
-            ", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines
-        ),
-    }
-    target = results.with_name("report.html")
-    write(
-        Page(
-            title=f"{record['experiment']}: {module.TITLE}",
-            lead=module.PUBLISHED,
-            command=record["command"],
-            sections=module.sections(record["measured"]),
-            facts=facts,
-        ),
-        target,
+    wanted = {key(cell["labels"]) for cell in cells}
+    return replace(
+        results,
+        cells=list(cells),
+        rows=[row for row in results.rows if key(row.labels) in wanted],
+        curves=[curve for curve in results.curves if key(curve.labels) in wanted],
     )
+
+
+def merged(earlier: Results, results: Results, every: list[Cell]) -> Results:
+    """Results of two commands, in the order of the experiment's cells."""
+    both = replace(
+        results,
+        cells=[*earlier.cells, *results.cells],
+        rows=[*earlier.rows, *results.rows],
+        curves=[*earlier.curves, *results.curves],
+    )
+    there = {named(cell["labels"]): cell for cell in both.cells}
+    parts = [_of_cells(both, [there[cell.name]]) for cell in every if cell.name in there]
+    before = [part for part in earlier.command.split(" && ") if part != results.command]
+    return replace(
+        both,
+        command=" && ".join([*before, results.command]),
+        cells=[cell for part in parts for cell in part.cells],
+        rows=[row for part in parts for row in part.rows],
+        curves=[curve for part in parts for curve in part.curves],
+    )
+
+
+# ------------------------------------------------------------------------------------- its page
+
+
+def page(path: pathlib.Path) -> pathlib.Path:
+    """Write `report.html` beside a `results.json`, from its rows alone."""
+    target = path.with_name("report.html")
+    write_page(describe(read(path)), target)
     return target
+
+
+def describe(results: Results) -> Page:
+    """The page of results."""
+    experiment = find(results.experiment)
+    machines = [cell["machine"] for cell in results.cells]
+    return Page(
+        title=f"{results.experiment}: {catalogue.EXPERIMENTS[results.experiment]}",
+        lead=experiment.published,
+        command=results.command,
+        sections=sections(experiment, results),
+        facts={
+            "budget": results.budget,
+            "runs": "; ".join(f"{named(c['labels'])}: {extent(c)}" for c in results.cells),
+            "machine": _once(f"{m['processor']}, {m['device']}, {m['system']}" for m in machines),
+            "versions": _once(
+                ", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines
+            ),
+        },
+    )
+
+
+def sections(experiment: Experiment, results: Results) -> list[Section]:
+    found: list[Section] = []
+    for view in experiment.views:
+        found += view(results, experiment.values) if callable(view) else [view]
+    return found
+
+
+def extent(cell: Mapping[str, Any]) -> str:
+    """Runs and their budget, in words; `cell` as recorded."""
+    budget = cell["budget"]
+    words = [f"{budget[name]:,} {name}" for name in ("frames", "generations") if name in budget]
+    words += [f"a score of {budget['stop_at']:,.0f}"] if "stop_at" in budget else []
+    return f"{len(cell['seeds'])} × {' or '.join(words)}"
 
 
 def _once(texts: Iterable[str]) -> str:
     return "; ".join(dict.fromkeys(texts))
-
-
-def extent(cell: dict[str, Any]) -> str:
-    """The budget of a run, in words; `cell` as recorded in a `results.json`."""
-    words = [
-        f"{cell[name]:,} {name}" if name == "frames" else f"{cell[name]} {name}"
-        for name in ("frames", "generations")
-        if cell.get(name) is not None
-    ]
-    early = [f"a score of {cell['stop_at']:,.0f}"] if cell.get("stop_at") is not None else []
-    return " or ".join(words + early)
-
-
-def _compact(results: dict[str, Any]) -> str:
-    """JSON with one line per list of numbers: small, and readable in a diff."""
-    encoder = json.JSONEncoder(ensure_ascii=False)
-
-    def render(value: Any, indent: int) -> str:
-        pad = " " * indent
-        if isinstance(value, dict) and value:
-            inner = ",\n".join(
-                f"{pad} {encoder.encode(str(k))}: {render(v, indent + 1)}" for k, v in value.items()
-            )
-            return f"{{\n{inner}\n{pad}}}"
-        if isinstance(value, list) and any(isinstance(v, dict | list) for v in value):
-            inner = ",\n".join(f"{pad} {render(v, indent + 1)}" for v in value)
-            return f"[\n{inner}\n{pad}]"
-        return encoder.encode(value)
-
-    return render(results, 0) + "\n"

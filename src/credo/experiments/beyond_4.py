@@ -1,315 +1,199 @@
 """Beyond chapter 4: difference rewards, depth 4, teams of LSTMs and GRUs, noisy observations, and
 servers that leave and join while a fleet works."""
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
-from .. import tree
-from ..analysis import attribution, fleet, statistics
+from ..analysis import fleet, statistics
 from ..environments.extended_tmaze import ExtendedTMaze
 from ..environments.server_fleet import ServerFleet
 from ..environments.wrappers import NoisyObservations
-from ..networks.recurrent import Recurrent
-from ..report.sections import Table
+from ..report import sections as page
+from ..report.rows import Results, Row, Series, rows
 from ..rollout import evaluate
-from ..runs.store import Run
-from . import chapter4, chapter4_fleet, fig_4_7
-from .base import Cell
+from . import fig_4_2, fig_4_7
+from .base import Cell, Experiment, Trained, Value
+from .dissertation import notes, told
+from .fig_3_4a import rounded
+from .views import Of, Runs, Table
 
-TITLE = "difference rewards, depth 4, LSTM teams, noise, fleets that change"
-PUBLISHED = (
-    "Not in the dissertation, which names noisy observations of the server fleet as future work "
-    "(section 4.2.5). The difference reward of a robot is the score minus what it would have been "
-    "without it."
-)
-BUDGETS = chapter4.BUDGETS
-FLEET = "synchronous, dmmu"  # a cell of Figure 4.7
 NOISE = 0.5  # in training; a request that was served is told as 1 or -1
 TESTED = (0.0, 0.25, 0.5, 1.0)
-QUESTIONS = {  # T-mazes by table
-    "Difference reward against global reward": (
-        "spread 2-deep, 3 robots",
-        "spread 2-deep, 4 robots",
-    ),
-    "Depth 4": ("spread 4-deep, fsp",),
-    "Robots by the cell of their networks": ("converge 2-deep, fsp", "spread 2-deep, 2 robots"),
+STD, REFERENCE = "noise of the test", "reference of a fleet"
+QUESTIONS: dict[str, dict[str, Any]] = {  # T-mazes by table
+    "Difference reward against global reward": {"task": "spread", "robots": (3, 4)},
+    "Depth 4": {"task": "spread", "depth": 4},
+    "Robots by the cell of their networks": {
+        "task": ("converge", "spread"),
+        "depth": 2,
+        "robots": (None, 2),
+    },
 }
 
 
 def cells(budget: str) -> list[Cell]:
-    return [*by_reward(budget), *deep(budget), *by_network(budget), *fleets(budget)]
-
-
-def by_reward(budget: str) -> list[Cell]:
-    """The score as everybody's fitness (cells of Figure 4.4), and each robot's own difference."""
-    found = []
-    for robots in (3,) if budget == "smoke" else (3, 4):
-        where, env = f"spread 2-deep, {robots} robots", _spread(robots)
-        both = dataclasses.replace(env, rewards=("score", "difference"))
-        found += [
-            chapter4.cell(f"{where}, mmu", env, "mmu", budget),
-            chapter4.cell(f"{where}, mmu on difference", both, "mmu", budget, fitness="difference"),
-        ]
-    return found
-
-
-def deep(budget: str) -> list[Cell]:
-    env = chapter4.beside("fsp", "spread", 4)
+    """Cells of Figures 4.2, 4.4 and 4.7, and beside each what is asked."""
+    tiny, maze = budget == "smoke", fig_4_2.cell
+    kinds = ("mmu", "lstm") if tiny else ("mmu", "lstm", "gru")
+    clear = fig_4_7.cells(budget)[0]  # DMMU, synchronous
+    noisy = replace(clear.algorithm, env=_noisy(clear.algorithm.env, NOISE))
     return [
-        chapter4.cell(f"spread 4-deep, fsp, {network}", env, network, budget)
-        for network in chapter4.NETWORKS
+        *(
+            maze(budget, "spread", 2, "mmu", robots=robots, fitness=fitness)
+            for robots in ((3,) if tiny else (3, 4))
+            for fitness in (None, "difference")
+        ),
+        *(maze(budget, "spread", 4, x, partner="fsp") for x in ("mmu", "ff")),
+        *(maze(budget, "converge", 2, x, partner="fsp") for x in kinds),
+        *(maze(budget, "spread", 2, x, robots=2) for x in kinds),
+        clear,
+        replace(clear, labels={**clear.labels, "noise": NOISE}, algorithm=noisy),
     ]
-
-
-def by_network(budget: str) -> list[Cell]:
-    """One beside a static robot and teams of two: MMUs (cells of Figures 4.2 and 4.4), LSTMs and
-    GRUs."""
-    tasks = {
-        "converge 2-deep, fsp": chapter4.beside("fsp", "converge", 2),
-        "spread 2-deep, 2 robots": _spread(2),
-    }
-    found = []
-    tiny = budget == "smoke"
-    for where, env in tasks.items():
-        mmu = chapter4.cell(f"{where}, mmu", env, "mmu", budget)
-        found.append(mmu)
-        for kind in ("lstm",) if tiny else ("lstm", "gru"):
-            network = Recurrent(kind, 3 if tiny else 20, "tanh")
-            algorithm = dataclasses.replace(mmu.algorithm, network=network)
-            found.append(dataclasses.replace(mmu, name=f"{where}, {kind}", algorithm=algorithm))
-    return found
-
-
-def fleets(budget: str) -> list[Cell]:
-    """DMMU as in Figure 4.7, and in noise."""
-    (clear,) = (cell for cell in fig_4_7.cells(budget) if cell.name == FLEET)
-    env = _noisy(clear.algorithm.env, NOISE)
-    algorithm = dataclasses.replace(clear.algorithm, env=env)
-    name = f"{FLEET} in noise {NOISE}"
-    return [clear, dataclasses.replace(clear, name=name, algorithm=algorithm)]
-
-
-def _spread(robots: int) -> ExtendedTMaze:
-    return ExtendedTMaze(depth=2, robots=robots, objective="spread", partner=None)
 
 
 def _noisy(env: ServerFleet, std: float) -> NoisyObservations:
     return NoisyObservations(env, std, spared=1)  # the status
 
 
-# ---------------------------------------------------------------------------------------- scores
+def measure(trained: Trained) -> Iterator[Row | Series]:
+    """As Figures 4.2 and 4.7; of fleets also the final champions in every noise, and without noise
+    what becomes of them when servers leave and join."""
+    maze = isinstance(trained.env, ExtendedTMaze)
+    for shared in fig_4_2.MEASURES if maze else fig_4_7.MEASURES:
+        yield from shared(trained)
+    if maze:
+        return
+    env = fig_4_7.clear(trained.env)
+    for std in TESTED:
+        net, labels = played(_noisy(env, std), trained.champions), {**trained.labels, STD: std}
+        yield from pairs("net requests in noise", net, labels, trained.seeds)
+    if "noise" not in trained.labels:
+        yield from changed(trained, env)
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    tasks = {name: cell[0].algorithm.env for name, cell in runs.items()}
-    mazes = {name: runs[name] for name, env in tasks.items() if isinstance(env, ExtendedTMaze)}
-    measured = chapter4.measure(mazes, budget)
-    for name in runs.keys() - mazes.keys():
-        measured[name] = _fleet(name, runs[name], tasks[name])
-    return {name: measured[name] for name in runs}
-
-
-def _fleet(name: str, runs: list[Run], env: ServerFleet | NoisyObservations) -> dict[str, Any]:
-    """Learning of a cell of fleets, its final champions in every noise, and without noise what
-    becomes of them when servers leave and join."""
-    noise = env.std if isinstance(env, NoisyObservations) else 0.0
-    clear = env.env if isinstance(env, NoisyObservations) else env
-    assert isinstance(clear, ServerFleet)
-    champions = tree.stack(*(run.champion for run in runs))
-    found = chapter4_fleet.outcome(name, runs, chapter4_fleet.references(clear))
-    found |= {"noise": noise, "in noise": in_noise(clear, champions)}
-    return found if noise else found | {"changes": changes(clear, champions)}
-
-
-def in_noise(env: ServerFleet, champions: PyTree) -> dict[str, Any]:
-    """Net requests per episode of every champion, mean and standard error, by the noise of the
-    test: `{std: [runs, 2]}`. All play in the same worlds."""
-    return {str(std): _means(played(_noisy(env, std), champions)) for std in TESTED}
-
-
-def changes(env: ServerFleet, champions: PyTree) -> dict[str, Any]:
-    """The same by what happens to the fleet, beside floors and ceilings of the same task; and the
-    difference that it makes, world by world: classes of devices are the same."""
-    found, before = {}, None
-    for name, (task, teams) in variants(env, champions).items():
-        net = played(task, teams)
+def changed(trained: Trained, env: ServerFleet) -> Iterator[Row]:
+    """Net requests by what happens to the fleet, beside baselines and bounds of the same task; and
+    the difference that it makes, world by world: classes of devices are the same."""
+    before = None
+    for name, (task, teams) in fleet.changes(env, trained.champions).items():
+        net, labels = played(task, teams), {**trained.labels, "fleet": name}
         before = net if before is None else before
+        yield from pairs("net requests of a fleet", net, labels, trained.seeds)
+        yield from pairs("change", net - before, labels, trained.seeds)
         known = fleet.floors_and_ceilings(task, 1000, key=jax.random.key(21_000))
-        found[name] = {
-            "ours": _means(net),
-            "change": _means(net - before),
-            "known": {who: attribution.plain(pair, 3) for who, pair in known.items()},
-        }
-    return found
+        for policy, found in known.items():
+            for metric, x in zip(both(REFERENCE), rounded(found, 3), strict=True):
+                yield from rows(metric, x, {**labels, "policy": policy})
 
 
-def variants(env: ServerFleet, team: Any) -> dict[str, tuple[ServerFleet, Any]]:
-    """What may happen to a fleet, by name: the task, and who plays it. A part of a DMMU or of a
-    population of them leaves, or clones of its first agents join, in mid-episode or before it."""
-    n, end = env.servers, env.max_steps
-    leave, join, half = max(1, 3 * n // 10), n // 2, end // 2
-    left = n - leave
-    stays, leaves, joins = ((0, end),), ((0, half),), ((half, end),)
-    smaller, larger = team.without(range(left, n)), team.with_clones(range(join))
-    fewer = dataclasses.replace(env, servers=left)
-    more = dataclasses.replace(env, servers=n + join)
-    leaving = dataclasses.replace(env, schedule=stays * left + leaves * leave)
-    joining = dataclasses.replace(more, schedule=stays * n + joins * join)
-    return {
-        f"{n} servers": (env, team),
-        f"{leave} of {n} leave at step {half}": (leaving, team),
-        f"{left} of {n} from the start": (fewer, smaller),
-        f"clones of {join} join at step {half}": (joining, larger),
-        f"clones of {join} from the start": (more, larger),
-    }
-
-
-def played(env: ServerFleet | NoisyObservations, champions: PyTree) -> Array:
+def played(env: ServerFleet | NoisyObservations, champions: Any) -> Array:
     """Net requests served in fresh episodes: `[runs, episodes]`. Classes of devices and episodes
     do not depend on how many servers there are."""
-    return evaluate(env, champions, chapter4_fleet.EPISODES, key=jax.random.key(20_002)).of("net")
+    return evaluate(env, champions, fig_4_7.EPISODES, key=jax.random.key(20_002)).of("net")
 
 
-def _means(net: Array) -> list[list[float]]:
+def both(metric: str) -> tuple[str, str]:
+    """Metrics of a mean and of its standard error."""
+    return metric, f"{metric}, s.e."
+
+
+def pairs(metric: str, net: Array, labels: Any, seeds: list[int]) -> Iterator[Row]:
     """Mean and standard error over the episodes of each run."""
-    return attribution.plain(np.stack(statistics.mean_and_standard_error(net.T), axis=1), 3)
+    found = statistics.mean_and_standard_error(net.T)
+    for name, values in zip(both(metric), found, strict=True):
+        yield from rows(name, rounded(values, 3), labels, seed=seeds)
 
 
-# ----------------------------------------------------------------------------------------- pages
+def pair(metric: str, sign: str = "", **labels: Any) -> Of:
+    """Mean ± standard error of every run or, of a policy, once; a dash for a champion that says
+    NaN."""
+
+    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        mean, error = (results.where(**labels).by_seed(name) for name in both(metric))
+        found = [(mean[seed][0], error[seed][0]) for seed in mean]
+        return ", ".join("–" if a is None else f"{a:{sign}.1f} ± {b:.1f}" for a, b in found) or None
+
+    return of
 
 
-def sections(measured: dict[str, Any]) -> list[Any]:
-    mazes = {name: cell for name, cell in measured.items() if "ceiling" in cell}
-    of_fleets = {name: cell for name, cell in measured.items() if "noise" in cell}
-    found = []
-    for question, places in QUESTIONS.items():
-        chosen = {name: cell for name, cell in mazes.items() if cell["where"] in places}
-        if chosen:
-            found += [shares(question, chosen), *chapter4.curves(chosen)]
-            found += chapter4.pictures(chosen)
-    if of_fleets:
-        found += [noise(of_fleets), *chapter4_fleet.curves(of_fleets)]
-    for cell in of_fleets.values():
-        if "changes" in cell:
-            found += [sizes(cell["changes"]), costs(cell["changes"])]
-    if mazes:
-        found.append(
-            chapter4.about(
-                "`on difference`: the fitness of an individual is its own difference reward; tests "
-                "and tables are of the score.",
-                f"Converge is trained on the author's bonuses, as in Figure 4.2. {chapter4.APART}",
-                "LSTMs and GRUs have as many units as an MMU, and the operators that were chosen "
-                "for it.",
-            )
-        )
-    if of_fleets:
-        found.append(
-            chapter4_fleet.about(
-                10,
-                chapter4_fleet.GENTLER,
-                "In noise every number that a server observes, but not its status, is told with an "
-                "error N(0, std²) of its own, in the units in which it is observed: a request's "
-                "worth is 1 or -1, a count at most 0.1. The curve of a cell in noise is of tests "
-                "in noise.",
-            )
-        )
-    return found
+def gain(policy: str) -> Of:
+    """What a change of the fleet brings to a script: the difference of two means."""
+
+    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        mean, error = (results.where(policy=policy).by_seed(x)[None] for x in both(REFERENCE))
+        return f"{mean[1] - mean[0]:+.1f} ± {float(np.hypot(*error)):.1f}"
+
+    return of
 
 
-def shares(question: str, measured: dict[str, Any]) -> Table:
-    """Scores of some cells, without a column for what was published."""
-    table = chapter4.scores(measured, {})
-    kept = [i for i, column in enumerate(table.columns) if column != "published"]
-    return Table(
-        f"{question}: trials in which the final champion team observes the reward, %",
-        [table.columns[i] for i in kept],
-        [[row[i] for i in kept] for row in table.rows],
-        table.caption,
-    )
-
-
-def noise(measured: dict[str, Any]) -> Table:
-    """Every champion of fleets, by the noise it is tested in."""
-    known = next(iter(measured.values()))["reference"]
-    return Table(
-        "Noisy observations: net requests of final champions, by the noise of the test",
-        ["std in training", "run", *(f"tested at std {std:g}" for std in TESTED)],
-        [
-            [
-                f"{cell['noise']:g}",
-                str(run),
-                *(_pair(net[run]) for net in cell["in noise"].values()),
-            ]
-            for cell in measured.values()
-            for run in range(len(cell["final"]))
-        ],
-        caption=f"Mean ± standard error over {chapter4_fleet.EPISODES} fresh episodes, the same "
-        f"for all. Without noise random servers earn {known['random']}, a script that discovers "
-        f"{known['discovering']}, an oracle {known['oracle']}.",
-    )
-
-
-def sizes(changed: dict[str, Any]) -> Table:
-    """Fleets that change, beside floors and ceilings of the same task."""
-    runs = range(len(next(iter(changed.values()))["ours"]))
-    return Table(
-        "Servers that leave and join: net requests of final champions",
-        [
-            "fleet",
-            "floor: random",
-            *(f"run {run}" for run in runs),
-            "a script that discovers",
-            "an oracle",
-        ],
-        [
-            [
-                name,
-                _pair(row["known"]["random"]),
-                *(_pair(row["ours"][run]) for run in runs),
-                _pair(row["known"]["discovering"]),
-                _pair(row["known"]["oracle"]),
-            ]
-            for name, row in changed.items()
-        ],
-        caption=f"Mean ± standard error over {chapter4_fleet.EPISODES} fresh episodes (floor, "
-        "script and oracle 1,000). Trained without noise and with nobody leaving or joining, then "
-        "not changed. Clones are of the first servers.",
-    )
-
-
-def costs(changed: dict[str, Any]) -> Table:
+def costs(results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
     """What a change of the fleet costs or brings, ours beside a fleet that shares all it finds."""
-    (_, first), *others = changed.items()
-    runs = range(len(first["ours"]))
-
-    def gain(row: dict[str, Any], who: str) -> str:
-        after, before = row["known"][who], first["known"][who]
-        return _pair((after[0] - before[0], float(np.hypot(after[1], before[1]))), "+")
-
-    return Table(
-        "Against the first row: what leaving costs and joining brings",
-        ["fleet", *(f"run {run}" for run in runs), "a script that discovers", "an oracle"],
-        [
-            [
-                name,
-                *(_pair(row["change"][run], "+") for run in runs),
-                gain(row, "discovering"),
-                gain(row, "oracle"),
-            ]
-            for name, row in others
-        ],
-        caption="Ours: mean ± standard error of the difference, world by world. Script and oracle: "
-        "of the difference of two means.",
-    )
+    first, *others = results.levels("fleet") or [None]
+    body = []
+    for name in others:
+        change = pair("change", "+")(results.where(fleet=name), values)
+        two = results.where(fleet=(first, name))
+        body.append([name, change, *(gain(x)(two, values) for x in ("discovering", "oracle"))])
+    if body:
+        title = "Against the first row: what leaving costs and joining brings"
+        columns = ["fleet", "each run", "a script that discovers", "an oracle"]
+        yield page.Table(title, columns, body, caption="World by world; of scripts, of two means.")
 
 
-def _pair(found: Sequence[float | None], sign: str = "") -> str:
-    mean, error = found
-    if mean is None:  # a champion that says NaN
-        return "–"
-    return f"{mean:{sign}.1f} ± {error:.1f}"
+def of_question(title: str, where: dict[str, Any]) -> list[Any]:
+    """Table, curves and pictures of the T-mazes of a question."""
+    heading = f"{title}: trials in which the final champion team observes the reward, %"
+    return [
+        replace(fig_4_2.SCORES, title=heading, where=where),
+        replace(fig_4_2.CURVES, where=where),
+        lambda results, values: fig_4_2.pictures(results.where(**where), values),
+    ]
+
+
+def if_any(task: str, view: Any) -> Any:
+    """A view that is shown if there is anything of its task."""
+    return lambda results, values: view(results, values) if results.where(task=task).rows else []
+
+
+FLEETS = {"task": "server fleet"}
+IN_NOISE = Runs(
+    "Noisy observations: net requests of final champions, by the noise of the test; {panel}",
+    {f"tested at std {x:g}": pair("net requests in noise", "", **{STD: x}) for x in TESTED},
+    panel=("task", "timing", "network", "noise"),
+    where=FLEETS,
+    caption="Mean ± standard error over 500 fresh episodes, the same for all.",
+)
+SIZES = Table(
+    "Servers that leave and join: net requests of final champions",
+    rows=("fleet",),
+    columns={
+        "baseline: random": pair(REFERENCE, policy="random"),
+        "each run": pair("net requests of a fleet"),
+        "a script that discovers": pair(REFERENCE, policy="discovering"),
+        "an oracle": pair(REFERENCE, policy="oracle"),
+    },
+    caption="Mean ± standard error over 500 fresh episodes (baseline, script and oracle 1,000). "
+    "Trained without noise and with nobody leaving or joining, then not changed. Clones are of "
+    "the first servers.",
+)
+EXPERIMENT = Experiment(
+    **told("beyond-4"),
+    budgets=fig_4_2.BUDGETS,
+    cells=cells,
+    measures=(measure,),
+    views=(
+        *(view for question in QUESTIONS.items() for view in of_question(*question)),
+        IN_NOISE,
+        replace(fig_4_7.SCORES, where=FLEETS),
+        replace(fig_4_7.CURVES, where=FLEETS),
+        SIZES,
+        costs,
+        if_any("spread", notes("T-mazes", "beyond-4, T-mazes")),
+        if_any("server fleet", notes("fleets", "beyond-4, fleets")),
+    ),
+)

@@ -9,21 +9,12 @@ from ..learners.sac import SAC
 from ..learners.td3 import TD3, TD3_NETWORK, ddpg
 from ..networks.exploration import GaussianNoise
 from ..networks.mlp import MLP, Critic
-from ..report.sections import Reference
-from . import chapter5
-from .base import Cell
-from .chapter5 import Plan
+from .base import Cell, Experiment
+from .dissertation import notes, told
+from .fig_5_3 import MEASURES, TABLE, Plan, cell, curves
+from .views import published
 
-TITLE = "DDPG, SAC and TD3 alone, on cheap tasks"
-PUBLISHED = (
-    "Not in the dissertation. The benchmark of RL Baselines3 Zoo has, for Pendulum-v1 at 20,000 "
-    "frames (one agent each, mean ± deviation of 750 episodes): DDPG -152.1 ± 94.3, SAC "
-    "-157.0 ± 88.7, TD3 -151.9 ± 90.2. The settings here are theirs. InvertedPendulum pays 1 per "
-    "step: 1,000 is all there is."
-)
-BUDGETS = ("smoke", "quick", "full", "published")
 SWING, BALANCE = "Pendulum-v1", "InvertedPendulum-v5"
-ZOO = {"ddpg": (-152.099, 94.282), "sac": (-156.995, 88.714), "td3": (-151.855, 90.227)}
 PLANS = {  # frames of either task, and runs
     "smoke": (600, 600, 2),
     "quick": (10_000, 10_000, 2),
@@ -47,43 +38,31 @@ def learners() -> dict[str, tuple[AbstractLearner, MLP, int]]:
 
 
 def cells(budget: str) -> list[Cell]:
+    """Each learner on both tasks."""
     swing, balance, runs = PLANS[budget]
-    found = []
-    for label, (learner, network, start) in learners().items():
-        for task, frames in ((SWING, swing), (BALANCE, balance)):
-            made = chapter5.cell(
-                f"{label} alone",  # the same learners have other settings elsewhere
-                OffPolicy.td3,
-                task,
-                budget,
-                planned=Plan(frames, runs),
-                network=network,
-                learner=learner,
-                start_frames=min(start if task == SWING else 1_000, frames // 2),
-                test_every=1_000,
-            )
-            found.append(made)
-    return found
-
-
-measure = chapter5.measure
-
-
-def sections(measured: dict[str, Any]) -> list[Any]:
-    given = {}
-    for name, cell in measured.items():
-        if cell["task"] == SWING:
-            mean, deviation = ZOO[cell["label"].split()[0]]
-            given[name] = f"{mean:.1f} ± {deviation:.1f}"
-    levels = {
-        SWING: [Reference(f"{label}, Zoo", mean) for label, (mean, _) in ZOO.items()],
-        BALANCE: [Reference("ceiling", 1000.0)],
-    }
     return [
-        *(
-            chapter5.curves(task, chapter5.of_task(measured, task), *levels[task])
-            for task in chapter5.tasks_in(measured)
-        ),
-        chapter5.scores(measured, given, reference={}, caption="Published: the Zoo, per episode."),
-        chapter5.about(measured),
+        cell(
+            f"{name} alone",  # the same learners have other settings elsewhere
+            OffPolicy.td3,
+            task,
+            budget,
+            planned=Plan(frames, runs),
+            network=network,
+            learner=learner,
+            start_frames=min(start if task == SWING else 1_000, frames // 2),
+            test_every=1_000,
+        )
+        for name, (learner, network, start) in learners().items()
+        for task, frames in ((SWING, swing), (BALANCE, balance))
     ]
+
+
+LEVELS = {f"{x}, Zoo": published("return", number=True, method=f"{x} alone") for x in learners()}
+LEVELS["upper bound"] = published("upper bound")
+EXPERIMENT = Experiment(
+    **told("check-learners", "mujoco"),
+    budgets=tuple(PLANS),
+    cells=cells,
+    measures=MEASURES,
+    views=(curves(**LEVELS), TABLE, notes("mujoco", "check-learners")),
+)

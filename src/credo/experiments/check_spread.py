@@ -1,8 +1,7 @@
 """MADDPG and MATD3 on simple_spread, before they serve as baselines."""
 
-from typing import Any
+import functools
 
-import jax
 import numpy as np
 
 from .. import tree
@@ -13,54 +12,43 @@ from ..learners.td3 import maddpg, matd3
 from ..networks.exploration import GaussianNoise
 from ..networks.mlp import Critic
 from ..networks.team import JointCritic, Team
-from ..report.sections import Curve, Figure, Reference, Table, Text
-from ..rollout import evaluate
-from ..runs.store import Run
-from . import chapter7
-from .base import Cell
-from .chapter5 import middle
-from .chapter7 import Plan
+from . import measures
+from .base import Cell, Experiment
+from .dissertation import notes, told
+from .fig_7_4 import Plan
+from .small import shrunk
+from .views import Curves, Table, known, mean, plain, published
 
-TITLE = "MADDPG and MATD3 on simple_spread"
-PUBLISHED = (
-    "Not in the dissertation. Others on simple_spread_v3 (continuous actions, local_ratio 0.5, "
-    "mean per agent): random -26.7, MADDPG -9.6 ± 0.3 after 10M steps, MATD3 -7.4 to -8.4 with one "
-    "seed stuck at -23.9, a script -7.5."
-)
 PLANS = {
     "smoke": Plan(1_000, 2),
     "quick": Plan(100_000, 2, 0.1),
     "full": Plan(1_000_000, 3, 0.1),
 }
 EPISODES = 500
-PUBLISHED_SCORES = {"maddpg": "-9.6 ± 0.3", "matd3": "-7.4 … -8.4, one -23.9"}
-BOUNDS = {"maddpg": -12.0, "matd3": -10.0}  # to be beaten before they serve as baselines
 LEARNERS = {"matd3": matd3, "maddpg": maddpg}
 
 
 def cells(budget: str) -> list[Cell]:
-    plan = PLANS[budget]
-    return [
-        Cell(
-            f"{name}, simple spread",
-            _algorithm(name, plan, budget),
-            None,
-            plan.runs,
-            frames=plan.frames,
-        )
-        for name in LEARNERS
-    ]
+    """Both learners."""
+    plan, found = PLANS[budget], []
+    for method in LEARNERS:
+        algorithm = build(method, plan)
+        algorithm = shrunk(algorithm) if budget == "smoke" else algorithm
+        labels = {"method": method, "task": "simple spread"}
+        found.append(Cell(labels, algorithm, range(plan.runs), frames=plan.frames))
+    return found
 
 
-def _algorithm(name: str, plan: Plan, budget: str) -> OffPolicy:
-    learner = LEARNERS[name](
+def build(method: str, plan: Plan) -> OffPolicy:
+    """With the settings of the published results."""
+    learner = LEARNERS[method](
         critic=JointCritic(Critic(hidden=(128, 128))),
         signal="local",
         gamma=0.95,
         noise=GaussianNoise(0.2),
         batch_size=256,
     )
-    algorithm = OffPolicy.matd3(
+    return OffPolicy.matd3(
         SimpleSpread(),
         Team(trunk=(128, 128), activation="relu"),
         learner=learner,
@@ -70,51 +58,46 @@ def _algorithm(name: str, plan: Plan, budget: str) -> OffPolicy:
         test_every=20_000,
         test_episodes=100,
     )
-    return chapter7.shrunk(algorithm) if budget == "smoke" else algorithm
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return {name: chapter7.outcome(name, cell, EPISODES, random) for name, cell in runs.items()}
-
-
+@functools.cache
 def random(env: SimpleSpread) -> dict[str, float]:
     """Mean return of actions drawn uniformly."""
-    anybody = tree.stack(planner.RandomTeam(env.agents))
-    played = evaluate(env, anybody, EPISODES, key=jax.random.key(21_000))
-    return {"random": round(float(np.mean(played.of("global"))), 2)}
+    team = tree.stack(planner.RandomTeam(env.agents))
+    played = measures.returns(env, team, EPISODES, measures.BASELINE_KEY)
+    return {"random": round(float(np.mean(played)), 2)}
 
 
-def sections(measured: dict[str, Any]) -> list[Any]:
-    any_cell = next(iter(measured.values()))
-    figure = Figure(
-        "simple_spread",
-        "frames",
-        "return of the actor, mean per agent",
-        [Curve(cell["method"], cell["frames"], cell["score"]) for cell in measured.values()],
-        references=(
-            Reference("random", any_cell["reference"]["random"]),
-            Reference("a script", -7.5),
-        ),
-    )
-    table = Table(
-        "Return per episode, mean over agents",
-        ["method", "floor: random", "published", "to be beaten", "ours, median (range)", "frames"],
-        [
-            [
-                cell["method"],
-                cell["reference"]["random"],
-                PUBLISHED_SCORES[cell["method"]],
-                BOUNDS[cell["method"]],
-                middle(cell["final"]),
-                f"{np.mean(cell['played']):,.0f}",
-            ]
-            for cell in measured.values()
-        ],
-        caption=f"Ours: {EPISODES} fresh episodes without noise.",
-    )
-    words = (
-        "The task is SimpleSpread, a JAX version that matches mpe2's simple_spread_v3 step for "
-        "step. A frame is one joint step; an update moves all three agents. Published numbers are "
-        "of other code and more frames."
-    )
-    return [figure, table, Text("How to read it", [words])]
+COLUMNS = {
+    "baseline: random": known("random"),
+    "published": published("return"),
+    "to be exceeded": published("to be exceeded"),
+    "final actor": mean("return"),
+    "median": plain("return", of=np.median),
+    "frames": plain("frames"),
+}
+CAPTION = f"Final actor: {EPISODES} fresh episodes without noise."
+LEVELS = {"random": known("random"), "a script": published("a script")}
+CURVES = Curves(
+    "test score",
+    "frames",
+    ["method"],
+    title="simple_spread",
+    y_label="return of the actor, mean per agent",
+    levels=LEVELS,
+)
+EXPERIMENT = Experiment(
+    **told("check-spread"),
+    cells=cells,
+    measures=(
+        measures.final(episodes=EPISODES, digits=3, each=False),
+        measures.scores(digits=3),
+        measures.effort,
+        measures.of_task(random),
+    ),
+    views=(
+        CURVES,
+        Table("Return per episode, mean over agents", ["method"], COLUMNS, caption=CAPTION),
+        notes("check-spread"),
+    ),
+)

@@ -1,34 +1,28 @@
-"""Figure 3.4b: an evolved MMU beside evolved recurrent networks, Sequence Classification."""
+"""Figure 3.4b: an evolved MMU beside evolved recurrent networks, sequence classification."""
 
-from typing import Any
+from .base import Cell, Experiment
+from .dissertation import told
+from .fig_3_4a import MEASURES, SUMMARY, TABLE, cell
 
-from ..runs.store import Run
-from . import chapter3_gradient, fig_3_4a
-from .base import Cell
-
-TITLE = "MMU, LSTM, GRU and RNN by evolution, Sequence Classification"
-PUBLISHED = (
-    "Figure 3.4b of the dissertation (curves): the MMU after 1,000 generations is above NEAT-RNN "
-    "and NEAT-LSTM after 15,000 (Rawal & Miikkulainen 2016), at depths 2 to 6. Here the networks "
-    "have a fixed form and are evolved by the same operators; NEAT is not here yet."
-)
-DEPTHS = {"smoke": (3,), "quick": (2, 4, 6), "full": (2, 3, 4, 5, 6)}
-NETWORKS = ("mmu", "lstm", "gru", "rnn")
-VARIANTS = ("as coded", "ours")
+DEPTHS = {
+    "classification": {"smoke": (3,), "quick": (2, 4, 6), "full": (2, 3, 4, 5, 6)},
+    "recall": {"smoke": (2,), "quick": (2, 4, 6), "full": (1, 2, 3, 4, 5, 6)},
+}
 
 
-def cells(budget: str) -> list[Cell]:
+def networks(budget: str, task: str, preset: str) -> list[Cell]:
+    """Four networks under the same operators."""
     return [
-        chapter3_gradient.cell("classification", depth, variant, budget, net)
-        for variant in VARIANTS
-        for net in NETWORKS
-        for depth in DEPTHS[budget]
+        cell(budget, task, depth, preset, network=network)
+        for network in ("mmu", "lstm", "gru", "rnn")
+        for depth in DEPTHS[task][budget]
     ]
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return fig_3_4a.measure(runs, budget)
+def cells(budget: str) -> list[Cell]:
+    """By the author's operators and by ours."""
+    return [x for y in ("as coded", "ours") for x in networks(budget, "classification", y)]
 
 
-def sections(measured: dict[str, Any]) -> list[Any]:
-    return [fig_3_4a.summary(measured, published=None), fig_3_4a.table(measured, {})]
+VIEWS = (SUMMARY, TABLE)
+EXPERIMENT = Experiment(**told("fig-3.4b"), cells=cells, measures=MEASURES, views=VIEWS)

@@ -5,88 +5,60 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ..analysis.generalization import success_with_gap
 from ..environments.sequence_classification import SequenceClassification
-from ..report.sections import Curve, Figure, Reference, Table
-from ..runs.store import Run
-from . import chapter3, fig_3_4a
-from .base import Cell
+from ..report.rows import Series, series
+from .base import Cell, Experiment, Trained
+from .dissertation import told
+from .fig_3_4a import LINE, TEST, evolved, learned, rounded
+from .views import Table, at, best, constant, mean, published
 
-TITLE = "generalization to 0..101 distractors"
-PUBLISHED = (
-    "Figure 3.5a of the dissertation: the 21-deep networks reach 43.2 ± 13.2 % with 101 "
-    "distractors between signals; the best single network 100 % at every number of distractors."
-)
 GAPS = {"smoke": (0, 15), "quick": (0, 5, 10, 15, 20, 40, 60, 80, 101)}
 GAPS["full"] = (0, 1, 2, 3, 5, 7, 10, 12, 15, 18, 20, 25, 30, 40, 50, 60, 70, 80, 90, 101)
-PUBLISHED_AT_LAST = 0.432
+SWEEP = "success by distractors", "distractors between signals"
 
 
 def cells(budget: str) -> list[Cell]:
-    return chapter3.classification_cells(budget, variants=("as coded", "ours"))
+    """As Figure 3.4a."""
+    return evolved(budget, ("as coded", "ours"))
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return {
-        name: sweep(cell, SequenceClassification(cell[0].algorithm.env.depth, 0, 101), GAPS[budget])
-        for name, cell in runs.items()
-    }
+def sweep(trained: Trained) -> list[Series]:
+    """Success by the number of distractors between signals."""
+    task = SequenceClassification(trained.env.depth, 0, 101)
+    return swept(SWEEP, trained, task, GAPS[trained.budget])
 
 
-def sweep(cell: list[Run], task: Any, gaps: tuple[int, ...]) -> dict[str, Any]:
-    """Success `[runs, gaps]` of a cell's champions."""
-    policies, key = chapter3.champions(cell), jax.random.key(20_000)
-    rows = [
-        chapter3.success_with_gap(
-            task, policies, jnp.int32(gap), key=key, episodes=chapter3.TEST // 5
-        )
+def swept(
+    axis: tuple[str, str], trained: Trained, task: Any, gaps: tuple[int, ...]
+) -> list[Series]:
+    """Success of the champions when every gap (or corridor) of a sequence has the same length."""
+    policies, key = trained.champions, jax.random.key(20_000)
+    found = [
+        success_with_gap(task, policies, jnp.int32(gap), key=key, episodes=TEST // 5)
         for gap in gaps
     ]
-    return {"gaps": list(gaps), "success": chapter3.rounded(jnp.stack(rows, axis=1))}
+    values = rounded(jnp.stack(found, axis=1))
+    return series(*axis, gaps, values, trained.labels, seed=trained.seeds)
 
 
-def sections(measured: dict[str, Any]) -> list[Any]:
-    return [
-        *(
-            figure(measured, variant, "distractors between signals", PUBLISHED_AT_LAST)
-            for variant in fig_3_4a.variants(measured)
-        ),
-        table(measured, {21: "43.2 ± 13.2"}, "distractors"),
-    ]
-
-
-def figure(measured: dict[str, Any], variant: str, x_label: str, published: float | None) -> Figure:
-    return Figure(
-        f"Champions of depth-trained runs, {variant}",
-        x_label,
-        "success, 200 fresh sequences",
-        [
-            Curve(f"{depth}-deep", cell["gaps"], cell["success"])
-            for depth, cell in fig_3_4a.of_variant(measured, variant).items()
-        ],
-        references=(Reference("published, 21-deep at 101", published),) if published else (),
-        y_range=(0.0, 1.02),
+def views(axis: tuple[str, str], what: str, first: int, **levels: float) -> tuple[Any, ...]:
+    """Curves by depth of the training, and a table of some points."""
+    curves = learned(
+        y=axis[0],
+        x=axis[1],
+        line=("depth",),
+        panel=LINE,
+        title="Champions by the depth they were trained at: {panel}",
+        y_label="success, 200 fresh sequences",
+        levels={name: constant(value) for name, value in levels.items()},
         caption="Trained on 10 to 20.",
     )
+    columns = {f"{x} {what}": at(x, mean(axis[0], 100, 1)) for x in (first, 15, 40, 101)}
+    columns |= {"published at 101": published("success at 101 distractors")}
+    columns |= {"best run, longest": best(axis[0], 100)}
+    return curves, Table("Success, %", rows=("depth", *LINE), columns=columns)
 
 
-def table(measured: dict[str, Any], given: dict[int, str], what: str) -> Table:
-    first = next(iter(measured.values()))["gaps"]
-    shown = [i for i, gap in enumerate(first) if gap in (first[0], 15, 40, 101)]
-    rows = []
-    for name, cell in measured.items():
-        depth, variant = chapter3.split_name(name)
-        values = [chapter3.percent([run[i] for run in cell["success"]]) for i in shown]
-        best = f"{100 * max(run[shown[-1]] for run in cell['success']):.1f}"
-        rows.append([str(depth), variant, *values, given.get(depth, ""), best])
-    last = first[shown[-1]]
-    return Table(
-        "Success in percent, mean ± standard error over runs",
-        [
-            "depth",
-            "variant",
-            *(f"{first[i]} {what}" for i in shown),
-            f"published at {last}" if last == 101 else "published",
-            f"best run at {last}",
-        ],
-        rows,
-    )
+VIEWS = views(SWEEP, "distractors", 0, **{"published, 21-deep at 101": 0.432})
+EXPERIMENT = Experiment(**told("fig-3.5a"), cells=cells, measures=(sweep,), views=VIEWS)

@@ -1,74 +1,63 @@
 """Figure 3.5b: MMUs trained at one depth, tested at depths up to 101."""
 
-from typing import Any
+from collections.abc import Sequence
 
+import jax
 import numpy as np
 
 from ..analysis import floors
-from ..report.sections import Curve, Figure, Reference, Table
-from ..runs.store import Run
-from . import chapter3, fig_3_4a
-from .base import Cell
+from ..analysis.generalization import first_mistakes
+from ..report import sections as page
+from ..report.rows import Results, Series, series
+from .base import Experiment, Trained, Value
+from .dissertation import told
+from .fig_3_4a import LINE, TEST, evolved, learned, rounded
+from .views import Curves, Table, at, best, constant, mean, published
 
-TITLE = "generalization to depth 101"
-PUBLISHED = (
-    "Figure 3.5b of the dissertation: trained 21-deep, 50.4 ± 9.3 % at depth 101 and 56.4 ± 10.9 % "
-    "at 66; trained 5-deep, 36.7 ± 4.3 % at 16; the best single network 100 % up to depth 91, 98 % "
-    "at 96 and 96 % at 101."
-)
 DEPTHS = (2, 3, 4, 5, 6, 8, 10, 13, 16, 21, 26, 31, 41, 51, 66, 81, 91, 96, 101)
-GIVEN = {(21, 101): "50.4 ± 9.3", (21, 66): "56.4 ± 10.9", (5, 16): "36.7 ± 4.3"}
 SHOWN = (16, 21, 66, 101)
+SWEEP = "success by depth"
 
 
-def cells(budget: str) -> list[Cell]:
-    return chapter3.classification_cells(budget)
+def sweep(trained: Trained) -> list[Series]:
+    """Success by the depth of the test; streams of 101 signals test every depth up to there."""
+    lengths = first_mistakes(trained.champions, DEPTHS[-1], TEST, key=jax.random.key(40_000))
+    success = rounded(np.stack([(lengths >= d).mean(axis=1) for d in DEPTHS], axis=1))
+    axis, labels = (SWEEP, "depth of the test", DEPTHS), trained.labels
+    return series(*axis, success, labels, seed=trained.seeds)
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    """An answer must be right at every signal, so that one stream of 101 signals tests every
-    depth up to there: success at depth d is a first mistake after signal d."""
-    measured = {}
-    for name, cell in runs.items():
-        lengths = chapter3.first_mistakes(chapter3.champions(cell), DEPTHS[-1], seed=40_000)
-        success = np.stack([(lengths >= d).mean(axis=1) for d in DEPTHS], axis=1)
-        measured[name] = {"depths": list(DEPTHS), "success": chapter3.rounded(success)}
-    return measured
-
-
-def sections(measured: dict[str, Any]) -> list[Any]:
-    figures = []
-    for variant in fig_3_4a.variants(measured):
-        trained = fig_3_4a.of_variant(measured, variant).items()
-        figures.append(
-            Figure(
-                f"Champions of depth-trained runs, {variant}",
-                "depth of the test",
-                "success, 1,000 fresh sequences",
-                [Curve(f"trained {d}-deep", c["depths"], c["success"]) for d, c in trained],
-                references=(Reference("published, 21-deep at 101", 0.504),),
-                y_range=(0.0, 1.02),
-            )
-        )
-    return [*figures, table(measured)]
-
-
-def table(measured: dict[str, Any]) -> Table:
-    rows = [["", "floor", *(_floor(depth) for depth in SHOWN), "", ""]]
-    for name, cell in measured.items():
-        trained, variant = chapter3.split_name(name)
-        at = {d: [run[i] for run in cell["success"]] for i, d in enumerate(cell["depths"])}
-        published = ", ".join(f"{v} at {d}" for (t, d), v in GIVEN.items() if t == trained)
-        values = [chapter3.percent(at[depth]) for depth in SHOWN]
-        best = f"{100 * max(at[101]):.1f}"
-        rows.append([str(trained), variant, *values, published, best])
-    return Table(
-        "Success in percent, mean ± standard error over runs",
-        ["trained", "variant", *(f"at {d}" for d in SHOWN), "published", "best run at 101"],
-        rows,
-        caption="The ceiling is 100 at every depth.",
+def curves(title: str, published: float) -> Curves:
+    """A figure for each trainer, a line for each depth of the training."""
+    return learned(
+        y=SWEEP,
+        x="depth of the test",
+        line=("depth",),
+        panel=LINE,
+        title=title,
+        y_label="success, 1,000 fresh sequences",
+        levels={"published, 21-deep at 101": constant(published)},
     )
 
 
-def _floor(depth: int) -> str:
-    return f"{100 * max(floors.classification_floors(depth).values()):.1f}"
+def baselines(results: Results, values: Sequence[Value]) -> list[page.Section]:
+    """Exact success without counting, at the depths of the table."""
+    found = [100 * max(floors.classification_floors(depth).values()) for depth in SHOWN]
+    title = "Baseline: the best policy that keeps at most one signal, %"
+    return [page.Table(title, [f"at {x}" for x in SHOWN], [[f"{x:.1f}" for x in found]])]
+
+
+COLUMNS = {f"at {x}": at(x, mean(SWEEP, 100, 1)) for x in SHOWN}
+COLUMNS |= {f"published at {x}": published(f"success at depth {x}") for x in SHOWN}
+COLUMNS |= {"best run at 101": at(101, best(SWEEP, 100))}
+TRAINED = {"depth": "trained at depth"}
+EXPERIMENT = Experiment(
+    **told("fig-3.5b"),
+    cells=evolved,
+    measures=(sweep,),
+    views=(
+        curves("Champions by the depth they were trained at: {panel}", 0.504),
+        Table("Success, %", ("depth", *LINE), COLUMNS, titles=TRAINED, caption="Upper bound: 100."),
+        baselines,
+    ),
+)

@@ -1,41 +1,25 @@
 """Figure 4.4: two to four learning robots, Spread, no static robot."""
 
-from typing import Any
-
-from ..environments.extended_tmaze import ExtendedTMaze
-from . import chapter4
-from .base import Cell
-
-TITLE = "Extended T-Maze, Spread, teams of learning robots"
-PUBLISHED = (
-    "Figure 4.4 of the dissertation (bars without numbers): MMU teams are better than feed-forward "
-    "ones at every size and grow with it, 2-deep and 3-deep; feed-forward teams hardly do."
-)
-BUDGETS = chapter4.BUDGETS
+from .base import Cell, Experiment
+from .dissertation import notes, told
+from .fig_4_2 import BUDGETS, MEASURES, VIEWS, cell
 
 
 def cells(budget: str) -> list[Cell]:
+    """By depth, size of the team and network."""
     depths, sizes = ((2,), (2,)) if budget == "smoke" else ((2, 3), (2, 3, 4))
     return [
-        chapter4.cell(
-            f"spread {depth}-deep, {robots} robots, {network}",
-            ExtendedTMaze(depth=depth, robots=robots, objective="spread", partner=None),
-            network,
-            budget,
-        )
+        cell(budget, "spread", depth, network, robots=robots)
         for depth in depths
         for robots in sizes
-        for network in chapter4.NETWORKS
+        for network in ("mmu", "ff")
     ]
 
 
-measure = chapter4.measure
-
-
-def sections(measured: dict[str, Any]) -> list[Any]:
-    return [
-        chapter4.scores(measured, {}),
-        *chapter4.curves(measured),
-        *chapter4.pictures(measured),
-        chapter4.about("Every robot has a population of its own."),
-    ]
+EXPERIMENT = Experiment(
+    **told("fig-4.4"),
+    budgets=BUDGETS,
+    cells=cells,
+    measures=MEASURES,
+    views=(*VIEWS, notes("T-mazes", "fig-4.4")),
+)

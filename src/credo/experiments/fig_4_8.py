@@ -1,70 +1,54 @@
 """Figure 4.8: who writes what to the shared memory, and when."""
 
-from typing import Any
+from collections.abc import Iterable, Sequence
 
-from ..report.sections import HeatMap, Table
-from . import chapter4_fleet, table_4_1
-from .base import Cell
+import numpy as np
 
-TITLE = "writes to the shared memory, by server"
-PUBLISHED = (
-    "Figure 4.8 of the dissertation: servers write when they are told what their last request was "
-    "worth, in the steps behind an action, and hardly when they act; each to cells of its own."
-)
-BUDGETS = table_4_1.BUDGETS
-SHOWN = 2  # configuration NGGN, as in the text of section 4.2.4
-
-
-def cells(budget: str) -> list[Cell]:
-    return table_4_1.cells(budget)
+from ..report import sections as page
+from ..report.rows import Results
+from .base import Experiment, Value
+from .dissertation import notes, told
+from .fig_4_2 import BUDGETS
+from .table_3_1 import of_best
+from .table_4_1 import MEASURES, cells
+from .views import Runs, of_metric
 
 
-measure = table_4_1.measure
-
-
-def sections(measured: dict[str, Any]) -> list[Any]:
-    row = measured["runs"][measured["best"]][SHOWN]
-    steps, servers = len(row["writes"]), len(row["writes"][0])
-    cells = len(row["writes"][0][0])
-    maps = [
-        HeatMap(
-            f"Server {'AB'[server]}: magnitude of its writes",
-            [[row["writes"][t][server][cell] for t in range(steps)] for cell in range(cells)],
-            [f"M{cell + 1}" for cell in range(cells)],
-            [
-                f"t={t + 1}: device {row['devices'][t][server]}"
-                if row["devices"][t][server] >= 0
-                else f"t={t + 1}: told"
-                for t in range(steps)
-            ],
+def heat_maps(results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
+    """Writes of each server of the best champion, by step and memory cell, in the configuration of
+    section 4.2.4."""
+    for server in results.levels("server"):
+        here = results.where(configuration="NGGN", server=server)
+        (devices,) = of_metric(here, "device").curves
+        writes = of_metric(here, "write").curves
+        chosen = [f"device {x}" if x >= 0 else "told" for x in devices.values]
+        yield page.HeatMap(
+            f"Server {server}: magnitude of its writes",
+            [curve.values for curve in writes],
+            [str(curve.labels["cell"]) for curve in writes],
+            [f"t={t}: {word}" for t, word in zip(devices.at, chosen, strict=True)],
             "step",
             "memory cell",
         )
-        for server in range(servers)
-    ]
-    shares = []
-    for i, run in enumerate(measured["runs"]):
-        told = acted = 0.0
-        for played in run:
-            for writes, devices in zip(played["writes"], played["devices"], strict=True):
-                for server, device in enumerate(devices):
-                    if device < 0:
-                        told += sum(writes[server])
-                    else:
-                        acted += sum(writes[server])
-        shares.append([str(i), f"{100 * told / (told + acted):.1f}"])
-    return [
-        *maps,
-        Table(
-            "Share of all writing that happens when a server is told what its request was worth",
-            ["run", "share, %"],
-            shares,
-            caption="Over the six configurations; half of the steps are of that kind.",
-        ),
-        chapter4_fleet.about(
-            table_4_1.EPISODES,
-            chapter4_fleet.STRONGER,
-            "Shown is the configuration of the dissertation's text, NGGN, on a linear scale (there "
-            "a logarithmic one).",
-        ),
-    ]
+
+
+def share_when_told(results: Results, values: Sequence[Value]) -> page.Cell:
+    """The share of a run's writing that happens when a server is told, in percent."""
+    dims = ("configuration", "server")
+    when = results.array("device", *dims).astype(int) < 0
+    writes = results.array("write", *dims, "cell").astype(np.float64).sum(axis=2)
+    return f"{100 * writes[when].sum() / writes.sum():.1f}"
+
+
+SHARES = Runs(
+    "Share of all writing that happens when a server is told what its request was worth",
+    {"share, %": share_when_told},
+    caption="Over the six configurations; half of the steps are of that kind.",
+)
+EXPERIMENT = Experiment(
+    **told("fig-4.8"),
+    budgets=BUDGETS,
+    cells=cells,
+    measures=MEASURES,
+    views=(of_best(heat_maps), SHARES, notes("case study", "fig-4.8")),
+)

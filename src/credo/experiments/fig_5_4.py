@@ -1,70 +1,52 @@
 """Figure 5.4: ERL without selection."""
 
-from typing import Any
+from collections.abc import Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
 from ..algorithms.erl import ERL
 from ..evolution.selection import Uniform
+from ..report.rows import Results
 from ..report.sections import Table
-from . import chapter5
-from .base import Cell
+from .base import Cell, Experiment, Value
+from .dissertation import notes, told
+from .fig_5_3 import MUJOCO, TABLE, cell, curves, tasks
 
-TITLE = "ERL without selection"
-PUBLISHED = (
-    "Figure 5.4 of the dissertation: without the selection operator the score, as a share of the "
-    "best of full ERL, falls by about 80 % on HalfCheetah and Swimmer."
-)
-BUDGETS = chapter5.BUDGETS
-TASKS = ("HalfCheetah-v5", "Swimmer-v5")
+WITH, WITHOUT = "erl", "erl without selection"
 
 
 def cells(budget: str) -> list[Cell]:
-    return [
-        cell
-        for task in chapter5.tasks(budget, TASKS)
-        for cell in (
-            chapter5.cell("erl", ERL.erl, task, budget),
-            chapter5.cell("erl no selection", ERL.erl, task, budget, selection=Uniform()),
-        )
-    ]
+    """ERL with and without selection."""
+    builds = {WITH: ERL.erl, WITHOUT: partial(ERL.erl, selection=Uniform())}
+    chosen = tasks(budget, ("HalfCheetah-v5", "Swimmer-v5"))
+    return [cell(x, builds[x], task, budget) for task in chosen for x in builds]
 
 
-measure = chapter5.measure
-
-
-def sections(measured: dict[str, Any]) -> list[Any]:
-    return [
-        *chapter5.by_task(measured),
-        ablation(measured),
-        chapter5.scores(measured),
-        chapter5.about(
-            measured,
-            "Without selection parents and elites are drawn uniformly. The champion that is tested "
-            "is still the fittest of its generation.",
-        ),
-    ]
-
-
-def ablation(measured: dict[str, Any]) -> Table:
+def ablation(results: Results, values: Sequence[Value]) -> Iterable[Table]:
     """Scores above a random policy, as a share of the best that full ERL had."""
     rows = []
-    for task in chapter5.tasks_in(measured):
-        pair = {cell["label"]: cell for cell in chapter5.of_task(measured, task)}
-        if len(pair) < 2:
-            continue
-        floor = pair["erl"]["floor"][0]
-        mean = {
-            label: np.array(cell["score"], np.float64).mean(axis=0) - floor
-            for label, cell in pair.items()
-        }
-        best = np.nanmax(mean["erl"])
-        left = mean["erl no selection"][-1] / best if best > 0 else float("nan")
-        change = f"{100 * (left - 1):+.0f} %" if best > 0 else "ERL is no better than random"
-        rows.append([task, best, mean["erl no selection"][-1], "~ -80 %", change])
-    return Table(
-        "What is lost without selection",
-        ["task", "best of ERL", "last of no selection", "published change", "measured change"],
-        rows,
-        caption="Means over runs, less the score of a random policy.",
-    )
+    for task in results.levels("task"):
+        here = results.where(task=task)
+        if {WITH, WITHOUT} <= set(here.levels("method")):
+            baseline = here.value("random", method=WITH)
+            best, last = (
+                here.array("test score", "seed", method=method).astype(np.float64).mean(axis=0)
+                - baseline
+                for method in (WITH, WITHOUT)
+            )
+            best, last = np.nanmax(best), last[-1]
+            change = f"{100 * (last / best - 1):+.0f} %" if best > 0 else "no better than random"
+            rows.append([task, best, last, "~ -80 %", change])
+    columns = ["task", "best of ERL", "last without selection", "published change", "change"]
+    if rows:
+        caption = "Means over runs, less the mean return of a random policy."
+        yield Table("What is lost without selection", columns, rows, caption)
+
+
+EXPERIMENT = Experiment(
+    **told("fig-5.4", "mujoco"),
+    **MUJOCO,
+    cells=cells,
+    views=(curves(), ablation, TABLE, notes("mujoco", "fig-5.4")),
+)

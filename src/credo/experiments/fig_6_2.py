@@ -1,44 +1,25 @@
 """Figure 6.2: CERL with two learners that fail alone."""
 
-from typing import Any
+from .base import Cell, Experiment
+from .dissertation import notes, told
+from .fig_5_3 import TABLE, curves
+from .fig_6_5 import ATTRIBUTION, PORTFOLIOS, cerl, parts, portfolio, tasks
+from .views import published
 
-from ..report.sections import Reference
-from . import chapter5, chapter6
-from .base import Cell
-
-TITLE = "two learners that fail alone"
-PUBLISHED = (
-    "Figure 6.2 of the dissertation: on Hopper, in 5 million frames, CERL with TD3 at γ = 0 and "
-    "γ = 1 reaches 2136 ± 512; each of the two alone, and evolution, stay at 1,000 or below."
-)
-BUDGETS = chapter6.BUDGETS
 GAMMAS = (0.0, 1.0)
 
 
 def cells(budget: str) -> list[Cell]:
-    (task,) = chapter6.tasks(budget, ("Hopper-v5",))
-    learners = chapter6.portfolio(GAMMAS)
-    return [
-        chapter6.cerl("cerl gamma 0 1", task, budget, learners=learners),
-        *chapter6.parts(task, budget, GAMMAS),
-    ]
+    """The portfolio and its parts."""
+    (task,) = tasks(budget, ("Hopper-v5",))
+    made = cerl(task, budget, "cerl of gamma 0 and 1", learners=portfolio(GAMMAS))
+    return [made, *parts(task, budget, GAMMAS)]
 
 
-measure = chapter6.measure
-
-
-def sections(measured: dict[str, Any]) -> list[Any]:
-    given = {
-        "cerl gamma 0 1 Hopper-v5": "2136 ± 512",
-        **dict.fromkeys(
-            ("td3 gamma 0 Hopper-v5", "td3 gamma 1 Hopper-v5", "ea of cerl Hopper-v5"), "≤ 1,000"
-        ),
-    }
-    levels = [Reference("published CERL, 5M", 2136.0)]
-    hopper = "Hopper-v5" in chapter5.tasks_in(measured)
-    return [
-        *chapter5.by_task(measured, *(levels if hopper else [])),
-        chapter5.scores(measured, given, interval=True),
-        *chapter6.attributions(measured),
-        chapter5.about(measured),
-    ]
+LEVELS = {"published CERL, 5M": published("return", number=True)}
+EXPERIMENT = Experiment(
+    **told("fig-6.2", "mujoco"),
+    **PORTFOLIOS,
+    cells=cells,
+    views=(curves(**LEVELS), TABLE, *ATTRIBUTION, notes("mujoco")),
+)

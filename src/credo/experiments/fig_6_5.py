@@ -1,39 +1,67 @@
-"""Figure 6.5: CERL, its learners alone, and evolution on four tasks."""
+"""Figure 6.5: CERL, its learners alone, and evolution on four tasks. Also what all experiments on
+CERL share: portfolios, their parts, measurements and views."""
 
+from dataclasses import replace
 from typing import Any
 
-from . import chapter5, chapter6, fig_5_3
-from .base import Cell
+from ..algorithms.erl import ERL
+from ..environments.gymnasium import Gymnasium
+from ..learners.td3 import TD3
+from . import beyond_5, fig_5_3, measures
+from .base import Cell, Experiment
+from .dissertation import notes, told
+from .fig_5_3 import BUDGETS, STAND_IN, TABLE, VARIANTS, cell, curves, long_view, td3
+from .views import Table, mean, published
 
-TITLE = "CERL against its parts on four tasks"
-PUBLISHED = (
-    "Figure 6.5 of the dissertation (curves without numbers): TD3 at γ 0.99 needs fewer frames "
-    "than CERL on Hopper, HalfCheetah and Walker2d, CERL fewer than the other TD3s; of Swimmer "
-    "only CERL and evolution are said to be capable."
-)
-BUDGETS = chapter6.BUDGETS
+PORTFOLIO = (0.9, 0.99, 0.997, 0.9995)  # γ of learners L1 to L4
+TASKS = ("Hopper-v5", "Swimmer-v5", "HalfCheetah-v5", "Walker2d-v5")
+HUMANOID = "Humanoid-v5"
+
+
+def cerl(task: str, budget: str, method: str = "cerl", **fields: Any) -> Cell:
+    """CERL with the published portfolio, unless `fields` have another."""
+    return cell(method, ERL.cerl, task, budget, **fields)
+
+
+def portfolio(gammas: tuple[float, ...]) -> tuple[TD3, ...]:
+    """TD3 as in `ERL.cerl`, at these discounts."""
+    like = ERL.cerl(Gymnasium(STAND_IN)).learners[0]
+    assert isinstance(like, TD3)
+    return tuple(replace(like, gamma=gamma) for gamma in gammas)
+
+
+def parts(task: str, budget: str, gammas: tuple[float, ...] = PORTFOLIO) -> list[Cell]:
+    """What a portfolio is made of: evolution, and each of its learners, alone."""
+    alone = [td3(task, budget, gamma) for gamma in gammas]
+    return [cerl(task, budget, "ea of cerl", learners=(), manager=None), *alone]
+
+
+def tasks(budget: str, of: tuple[str, ...] = TASKS) -> tuple[str, ...]:
+    """Fewer at quick: a portfolio of four takes four times as long."""
+    return fig_5_3.tasks(budget, of)[: 1 if budget == "quick" else None]
 
 
 def cells(budget: str) -> list[Cell]:
-    chosen = chapter6.tasks(budget)
-    found = [
-        cell
-        for task in chosen
-        for cell in (chapter6.cerl("cerl", task, budget), *chapter6.parts(task, budget))
-    ]
-    if "Swimmer-v5" in chosen:
-        found.append(chapter5.td3_gamma("Swimmer-v5", budget, 0.9999))
-    return found
+    """CERL and its parts."""
+    chosen = tasks(budget)
+    found = [x for task in chosen for x in (cerl(task, budget), *parts(task, budget))]
+    return found + long_view(chosen, budget)
 
 
-measure = chapter6.measure
-
-
-def sections(measured: dict[str, Any]) -> list[Any]:
-    swimmer = [fig_5_3.SWIMMER] if fig_5_3.LONG_VIEW in measured else []
-    return [
-        *chapter5.by_task(measured),
-        chapter5.scores(measured, interval=True),
-        *chapter6.attributions(measured),
-        chapter5.about(measured, *swimmer),
-    ]
+ATTRIBUTION = (beyond_5.makers, beyond_5.ANCESTRY, beyond_5.ALLOCATION, beyond_5.FATE)
+ALLOCATION = Table(
+    "Cumulative allocation, in percent of all rollout workers",
+    ["task", *VARIANTS, "learner"],
+    {"published": published("allocation, %"), "measured": mean("allocation", 100, digits=1)},
+    caption="An even share of four learners is 25 %.",
+)
+PORTFOLIOS: dict[str, Any] = {
+    "budgets": BUDGETS,
+    "measures": (*fig_5_3.MEASURES, measures.of_portfolio),
+}
+EXPERIMENT = Experiment(
+    **told("fig-6.5", "mujoco"),
+    **PORTFOLIOS,
+    cells=cells,
+    views=(curves(), TABLE, *ATTRIBUTION, notes("mujoco", "swimmer")),
+)

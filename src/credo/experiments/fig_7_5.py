@@ -1,22 +1,19 @@
 """Figure 7.5: paths of teams at coupling 3."""
 
-from typing import Any
+from collections.abc import Iterable, Sequence
 
+import jax
 import numpy as np
 
-from ..report import replay_page, trajectories
-from ..report.sections import Drawing, Table
-from ..runs.store import Run
-from . import chapter7
-from .base import Cell
-from .chapter7 import Plan
+from ..report import trajectories
+from ..report.rows import Results, Row, Series, rows, series
+from ..report.sections import Drawing
+from ..rollout import record
+from .base import Cell, Experiment, Trained, Value, named
+from .dissertation import notes, told
+from .fig_7_4 import MEASURES, Plan, cell, rovers, table
+from .views import Table, plain, present
 
-TITLE = "paths at coupling 3"
-PUBLISHED = (
-    "Figure 7.5 of the dissertation: MERL partly trained drives each rover to a POI and observes "
-    "none; fully trained it observes 3 of 4 in two teams of three; MATD3-mixed observes none."
-)
-BUDGETS = chapter7.BUDGETS
 PLANS = {
     "smoke": Plan(1_500, 1),
     "quick": Plan(150_000, 1),
@@ -25,62 +22,69 @@ PLANS = {
 }
 PARTLY = {"smoke": 1_000, "quick": 25_000, "full": 25_000, "published": 100_000}  # frames
 SEED = 7  # of the one world that all are shown in
-EPISODES = 100
+TEAMS = ("method", "coupling", "training")
 
 
 def cells(budget: str) -> list[Cell]:
-    plan, env = PLANS[budget], chapter7.task("matd3 mixed", coupling=3)
-    full = [
-        chapter7.cell(m, env, "coupling 3, paths", budget, plan) for m in ("merl", "matd3 mixed")
-    ]
-    partly = plan._replace(frames=PARTLY[budget])
-    return [chapter7.cell("merl", env, "coupling 3, paths, partly trained", budget, partly), *full]
-
-
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return {name: _shown(name, cell[0]) for name, cell in runs.items()}
-
-
-def _shown(name: str, run: Run) -> dict[str, Any]:
-    """One world in full, and the mean of many."""
-    env = run.algorithm.env
-    (episode,) = replay_page.play(env, run.champion, [SEED])
-    return {
-        **chapter7.outcome(name, [run]),
-        "position": np.round(np.asarray(episode.position, np.float64), 2).tolist(),
-        "poi": np.round(np.asarray(episode.poi, np.float64), 2).tolist(),
-        "observed": np.asarray(episode.observed[-1]).astype(int).tolist(),
-        "activation distance": float(env.activation_distance),
-        "size": float(env.size),
-    }
-
-
-def _drawn(name: str, cell: dict[str, Any], dark: bool, prefix: str) -> str:
-    return trajectories.trajectories(
-        cell["position"],
-        cell["poi"],
-        np.array(cell["observed"], bool),
-        activation_distance=cell["activation distance"],
-        size=cell["size"],
-        title=name,
-        dark=dark,
-        prefix=prefix,
-    )
-
-
-def sections(measured: dict[str, Any]) -> list[Any]:
-    drawings = [
-        Drawing(name, *(_drawn(name, cell, dark, f"t{i}{dark:d}-") for dark in (False, True)))
-        for i, (name, cell) in enumerate(measured.items())
-    ]
-    seen = Table(
-        "POIs observed in the world that is drawn",
-        ["team", "observed, of 4"],
-        [[name, int(sum(cell["observed"]))] for name, cell in measured.items()],
-    )
+    """MERL partly and fully trained, and MATD3."""
+    plan, env = PLANS[budget], rovers("matd3 mixed", coupling=3)
+    partly, place = plan._replace(frames=PARTLY[budget]), {"coupling": 3, "paths": True}
     return [
-        *drawings,
-        seen,
-        chapter7.scores(measured),
-        chapter7.about("One run of each, one world for all: a picture, no evidence."),
+        cell("merl", env, place | {"training": "partly trained"}, budget, partly),
+        cell("merl", env, place, budget, plan),
+        cell("matd3 mixed", env, place, budget, plan),
     ]
+
+
+def paths(cell: Trained) -> list[Row | Series]:
+    """Where rovers of each run drove in one world (m), and which POIs they observed."""
+    key = jax.random.key(SEED)
+    worlds = [cell.env.shown(record(cell.env, run.champion, key=key)) for run in cell.runs]
+    place = np.round([np.asarray(world["position"], np.float64) for world in worlds], 2)
+    poi, steps = np.round(np.asarray(worlds[0]["poi"], np.float64), 2), np.arange(place.shape[1])
+    seeds, found = cell.seeds, []
+    for axis, name in enumerate(("x", "y")):
+        along = np.moveaxis(place[..., axis], 1, 2)  # [runs, rovers, steps]
+        found += series(name, "step", steps, along, cell.labels, seed=seeds, rover=None)
+        found += rows(f"POI {name}", poi[:, axis], cell.labels, poi=None)
+    observed = [np.asarray(world["observed"][-1]).astype(int) for world in worlds]
+    found += rows("observed", observed, cell.labels, seed=seeds, poi=None)
+    found += rows("activation distance", float(cell.env.activation_distance), cell.labels)
+    return found + rows("size", float(cell.env.size), cell.labels)
+
+
+def drawings(results: Results, values: Sequence[Value]) -> Iterable[Drawing]:
+    """The paths of every team, of its first run."""
+    for i, team in enumerate(results.cells):
+        told = {name: team["labels"].get(name) for name in TEAMS}
+        here, title = results.where(**told), named(present(told))
+        (xs, ys), (poi_x, poi_y) = (
+            (here.array(f"{kind}x", *dims), here.array(f"{kind}y", *dims))
+            for kind, dims in (("", ("seed", "rover")), ("POI ", ("poi",)))
+        )
+        colours = (
+            trajectories.trajectories(
+                np.stack([xs[0].T, ys[0].T], axis=-1).astype(np.float64),
+                np.stack([poi_x, poi_y], axis=-1).astype(np.float64),
+                here.array("observed", "seed", "poi")[0].astype(bool),
+                activation_distance=here.value("activation distance"),
+                size=here.value("size"),
+                title=title,
+                dark=dark,
+                prefix=f"t{i}{dark:d}-",
+            )
+            for dark in (False, True)
+        )
+        yield Drawing(title, *colours)
+
+
+OBSERVED = Table(
+    "POIs observed in the world that is drawn", TEAMS, {"observed, of 4": plain("observed", 4)}
+)
+EXPERIMENT = Experiment(
+    **told("fig-7.5"),
+    budgets=tuple(PLANS),
+    cells=cells,
+    measures=(*MEASURES, paths),
+    views=(drawings, OBSERVED, table(*TEAMS), notes("rovers", "fig-7.5")),
+)

@@ -1,111 +1,86 @@
 """Note on runtime of section 5.5: what evolution adds to the time of a learner."""
 
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from ..algorithms.erl import ERL
 from ..algorithms.off_policy import OffPolicy
 from ..analysis import attribution
-from ..report.sections import Table
+from ..report import sections as page
+from ..report.rows import Results, Row, rows
 from ..runs import log
-from ..runs.store import Run
-from . import chapter5
-from .base import Cell
-from .chapter5 import Plan
+from ..runs.loop import Run
+from .base import Cell, Experiment, Trained, Value
+from .dissertation import notes, told
+from .fig_5_3 import Plan, cell, tasks
+from .views import Table, mean, per_seed
 
-TITLE = "time of ERL over that of DDPG"
-PUBLISHED = (
-    "Section 5.5 of the dissertation: ERL took about 3 % more time than DDPG, most of it mutation."
-)
 PLANS = {"smoke": Plan(600, 2), "quick": Plan(60_000, 2), "full": Plan(200_000, 3)}
-TASK = "HalfCheetah-v5"  # its episodes have the same length for everybody
 NEVER = 2**31 - 1
 WARM = 0.25  # of the frames: what is compiled is compiled by then
+TIME = "seconds per 1000 frames"
 
 
 def cells(budget: str) -> list[Cell]:
-    """Both without tests but the first: their tests differ in number."""
-    (task,) = chapter5.tasks(budget, (TASK,))
-    kinds = {"erl untested": ERL.erl, "ddpg untested": OffPolicy.ddpg}
+    """Both without tests but the first: their tests differ in number. The task's episodes have the
+    same length for all."""
+    (task,) = tasks(budget, ("HalfCheetah-v5",))[:1]
     return [
-        chapter5.cell(
-            label,
-            build,
-            task,
-            budget,
-            planned=PLANS[budget],
-            test_every=NEVER,
-        )
-        for label, build in kinds.items()
+        Cell({"method": x, "task": task, "untested": True}, c.algorithm, c.seeds, frames=c.frames)
+        for x, build in {"erl": ERL.erl, "ddpg": OffPolicy.ddpg}.items()
+        for c in [cell(x, build, task, budget, planned=PLANS[budget], test_every=NEVER)]
     ]
 
 
-def measure(runs: dict[str, list[Run]], budget: str) -> dict[str, Any]:
-    return {
-        name: {
-            "task": chapter5.task_of(cell[0].algorithm.env),
-            "label": chapter5.label_of(name),
-            **{
-                key: attribution.plain([rate[key] for rate in map(rates, cell)], 6)
-                for key in ("seconds per 1000 frames", "updates per frame", "seconds", "frames")
-            },
-        }
-        for name, cell in runs.items()
-    }
+def times(cell: Trained) -> Iterable[Row]:
+    """What the clock says of each run."""
+    found = [rates(run) for run in cell.runs]
+    for name in found[0]:
+        values = attribution.plain([x[name] for x in found], 6)
+        yield from rows(name, values, cell.labels, seed=cell.seeds)
 
 
 def rates(run: Run) -> dict[str, float]:
     """Time and updates per frame after the first quarter of a run."""
-    metrics, timing = run.metrics, log.read(run.path / "timing.csv")
+    metrics, timing = run.metrics, log.read(run.path / log.TIMING)
     # A line of the clock may stand for several generations; it has the time after the last.
-    rows = np.searchsorted(metrics["generation"], timing["generation"])
+    places = np.searchsorted(metrics["generation"], timing["generation"])
     columns = metrics["frames"], np.cumsum(metrics["updates"])
-    frames, updates = (np.append(0.0, column[rows]) for column in columns)
+    frames, updates = (np.append(0.0, column[places]) for column in columns)
     seconds = np.append(0.0, timing["seconds"])
-    first = min(int(np.searchsorted(frames, WARM * frames[-1])), len(rows) - 1)
+    first = min(int(np.searchsorted(frames, WARM * frames[-1])), len(places) - 1)
     played = frames[-1] - frames[first]
     return {
-        "seconds per 1000 frames": 1000 * (seconds[-1] - seconds[first]) / played,
+        TIME: 1000 * (seconds[-1] - seconds[first]) / played,
         "updates per frame": (updates[-1] - updates[first]) / played,
         "seconds": seconds[-1],
         "frames": frames[-1],
     }
 
 
-def sections(measured: dict[str, Any]) -> list[Any]:
-    rows = [
-        [
-            cell["task"],
-            cell["label"].removesuffix(" untested"),
-            chapter5.spread(cell["frames"]),
-            chapter5.spread(cell["updates per frame"]),
-            chapter5.spread(cell["seconds"]),
-            chapter5.spread(cell["seconds per 1000 frames"]),
-        ]
-        for cell in measured.values()
-    ]
-    return [
-        Table(
-            "Time, mean ± standard deviation over runs",
-            ["task", "algorithm", "frames", "updates per frame", "seconds", "s per 1000 frames"],
-            rows,
-            caption="Updates and time per frame after the first quarter of each run, so that "
-            "compiling does not count.",
-        ),
-        *([extra(measured)] if len(measured) == 2 else []),
-        chapter5.about(measured),
-    ]
+def extra(results: Results, values: Sequence[Value]) -> Iterable[page.Table]:
+    """Time of ERL over that of DDPG, seeds paired."""
+    erl, ddpg = (per_seed(results.where(method=method), TIME) for method in ("erl", "ddpg"))
+    added = {seed: 100 * (erl[seed] / ddpg[seed] - 1) for seed in erl if seed in ddpg}
+    if added:
+        yield page.Table(
+            "Extra time of ERL, in percent",
+            ["published", "measured"],
+            [["+3", page.Summary(list(added.values()), list(added), digits=1)]],
+            caption="Wall clock, seeds paired. Whatever else runs on the machine is in it: use "
+            "--jobs 1 on an idle one. The population plays its episodes side by side, DDPG one at "
+            "a time.",
+        )
 
 
-def extra(measured: dict[str, Any]) -> Table:
-    time = {cell["label"]: np.array(cell["seconds per 1000 frames"]) for cell in measured.values()}
-    added = 100 * (time["erl untested"] / time["ddpg untested"] - 1)
-    return Table(
-        "Extra time of ERL",
-        ["published, %", "measured, %", "each seed, %"],
-        [["+3", chapter5.spread(added), ", ".join(f"{x:+.1f}" for x in added)]],
-        caption="Wall clock, seeds paired. Whatever else runs on the machine is in it: use "
-        "--jobs 1 on an idle one. The population plays its episodes side by side, DDPG one at a "
-        "time.",
-    )
+CLOCK = Table(
+    "Time",
+    ["task", "method"],
+    {name: mean(name) for name in ("frames", "updates per frame", "seconds", TIME)},
+    caption="Updates and time per frame after the first quarter of each run, so that compiling "
+    "does not count.",
+)
+EXPERIMENT = Experiment(
+    **told("note-5.5"), cells=cells, measures=(times,), views=(CLOCK, extra, notes("mujoco"))
+)

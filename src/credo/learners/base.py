@@ -2,6 +2,7 @@
 share."""
 
 import abc
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -74,26 +75,16 @@ def learn(
 
 
 @jit
-def _learn(
-    learner: AbstractLearner,
-    state: PyTree,
-    replay: Replay,
-    updates: Int[Array, ""],
-    *,
-    signal: str,
-    moments: Moments | None = None,
-    key: PRNGKeyArray,
-) -> tuple[PyTree, Metrics]:
+def _learn(learner, state, replay, updates, *, signal, moments: Moments | None = None, key):
     dynamic, static = eqx.partition(state, eqx.is_array)
 
     def body(i, loop):
         dynamic, total = loop
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
         rows = replay.sample(learner.batch_size, together=learner.together, key=sample_key)
-        reward = rows.rewards[learner.signal or signal]
-        ends = (rows.terminated, rows.truncated, rows.active)
+        reward, ends = rows.rewards[learner.signal or signal], (rows.terminated, rows.truncated)
         obs, after = seen(moments, rows.obs), seen(moments, rows.next_obs)
-        batch = Batch(obs, rows.action, reward, after, *ends)
+        batch = Batch(obs, rows.action, reward, after, *ends, rows.active)
         state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)
         return eqx.filter(state, eqx.is_array), jax.tree.map(jnp.add, total, metrics)
 
@@ -121,16 +112,26 @@ def adam(
 
 
 def adam_state(weights: PyTree) -> optax.OptState:
+    """The state of Adam before its first step."""
     return optax.adam(0.0).init(eqx.filter(weights, eqx.is_inexact_array))
 
 
+def descend(
+    loss: Callable[..., Any], given: tuple, state: optax.OptState, rate: Any, max_norm: Any = None
+) -> tuple[PyTree, optax.OptState, Any]:
+    """One step of `adam` down the gradient of `loss(*given)` by its first argument, the weights.
+
+    **Returns:** the weights, the state of Adam, and what the loss returned: its value and a second
+    thing.
+    """
+    said, gradient = eqx.filter_value_and_grad(loss, has_aux=True)(*given)
+    return *adam(given[0], gradient, state, rate, max_norm), said
+
+
 def polyak(target: PyTree, source: PyTree, tau: Float[Array, ""] | float) -> PyTree:
-    """θ' ← τθ + (1-τ)θ'."""
-    return jax.tree.map(
-        lambda old, new: tau * new + (1.0 - tau) * old if eqx.is_inexact_array(old) else old,
-        target,
-        source,
-    )
+    """θ' ← τθ + (1-τ)θ', leaf by leaf."""
+    new, old = (eqx.filter(x, eqx.is_inexact_array) for x in (source, target))
+    return eqx.combine(optax.incremental_update(new, old, tau), target)
 
 
 def features_first(x: Float[Array, "batch *agents size"]) -> Float[Array, "size batch *agents"]:

@@ -51,19 +51,17 @@ class AbstractManager(eqx.Module):
 
         def one(ledger, new):
             value, counts = new
-            # A learner that said NaN has had its turn, but no value that could be compared.
-            good = jnp.isfinite(value)
+            # A learner that returned NaN has had its turn, but no value that could be compared.
+            good = counts & jnp.isfinite(value)
             value = jnp.where(good, value, 0.0)
             α = jnp.where(ledger.known[i], self.memory, 1.0)
-            mean = α * value + (1.0 - α) * ledger.value[i]
-            square = α * value**2 + (1.0 - α) * ledger.square[i]
-            after = Ledger(
-                jnp.where(good, ledger.value.at[i].set(mean), ledger.value),
-                jnp.where(good, ledger.square.at[i].set(square), ledger.square),
-                ledger.count.at[i].add(1),
-                ledger.known.at[i].set(ledger.known[i] | good),
-            )
-            return jax.tree.map(lambda a, b: jnp.where(counts, a, b), after, ledger), None
+
+            def blended(new, old):
+                return old.at[i].set(jnp.where(good, α * new + (1.0 - α) * old[i], old[i]))
+
+            means = blended(value, ledger.value), blended(value**2, ledger.square)
+            count = ledger.count.at[i].add(counts.astype(jnp.int32))
+            return Ledger(*means, count, ledger.known.at[i].max(good)), None
 
         return jax.lax.scan(one, ledger, (returns, played))[0]
 

@@ -25,7 +25,7 @@ from ..networks.mlp import (
     linear,
 )
 from ..types import Batch, Metrics
-from .base import AbstractLearner, adam, adam_state, polyak
+from .base import AbstractLearner, adam, adam_state, descend, polyak
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # of the authors' code
 
@@ -127,16 +127,14 @@ class SAC(AbstractLearner):
         alpha = jnp.exp(state.log_alpha)
 
         target = self.soft_target(state, batch, alpha, key=target_key)
-        critic_loss, gradient = eqx.filter_value_and_grad(soft_critic_error)(
-            state.critics, batch, target
+        given = (state.critics, batch, target)
+        critics, critic_opt, (critic_loss, _) = descend(
+            soft_critic_error, given, state.critic_opt, self.critic_lr
         )
-        critics, critic_opt = adam(state.critics, gradient, state.critic_opt, self.critic_lr)
-
-        (actor_loss, log_p), gradient = eqx.filter_value_and_grad(soft_actor_loss, has_aux=True)(
-            state.actor, critics, batch, alpha, key=actor_key
+        given = (state.actor, critics, batch, alpha, actor_key)
+        actor, actor_opt, (actor_loss, log_p) = descend(
+            soft_actor_loss, given, state.actor_opt, self.actor_lr
         )
-        actor, actor_opt = adam(state.actor, gradient, state.actor_opt, self.actor_lr)
-
         # The temperature rises while the entropy -log_p is below its target.
         entropy = self.target_entropy * batch.action.shape[1]
         gradient = -jnp.mean(log_p + entropy)
@@ -167,10 +165,10 @@ class SAC(AbstractLearner):
 
 def soft_critic_error(
     critics: tuple[AbstractCriticNetwork, ...], batch: Batch, target: Float[Array, " batch"]
-) -> Float[Array, ""]:
+) -> tuple[Float[Array, ""], None]:
     """Half the sum over critics of the mean squared Bellman error."""
     qs = jnp.stack([critic(batch.obs.T, batch.action.T) for critic in critics])
-    return 0.5 * jnp.sum(jnp.mean(jnp.square(qs - target[None]), axis=1))
+    return 0.5 * jnp.sum(jnp.mean(jnp.square(qs - target[None]), axis=1)), None
 
 
 def soft_actor_loss(
@@ -178,7 +176,6 @@ def soft_actor_loss(
     critics: tuple[AbstractCriticNetwork, ...],
     batch: Batch,
     alpha: Float[Array, ""],
-    *,
     key: PRNGKeyArray,
 ) -> tuple[Float[Array, ""], Float[Array, " batch"]]:
     """E[α log π(a|s) - min_i Q_i(s, a)] and log π, a drawn from the policy."""

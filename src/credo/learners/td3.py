@@ -6,6 +6,7 @@ authors' first code. Time limits bootstrap; the author of ERL took them for the 
 The author clipped the gradient of DDPG's critic twice and of its actor never; both are clipped.
 """
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -23,8 +24,8 @@ from ..types import Batch, Metrics
 from .base import (
     AbstractLearner,
     act,
-    adam,
     adam_state,
+    descend,
     features_first,
     mean,
     polyak,
@@ -113,29 +114,23 @@ class TD3(AbstractLearner):
     def update(
         self, state: TD3State, batch: Batch, *, key: PRNGKeyArray
     ) -> tuple[TD3State, Metrics]:
-        target = self.bellman_target(state, batch, key=key)
-        (critic_loss, q), gradient = eqx.filter_value_and_grad(critic_error, has_aux=True)(
-            state.critics, batch, target
-        )
-        critics, critic_opt = adam(
-            state.critics, gradient, state.critic_opt, self.critic_lr, self.critic_max_norm
-        )
-        moving = (state.actor, state.target_actor, state.target_critics, state.actor_opt)
+        given = (state.critics, batch, self.bellman_target(state, batch, key=key))
+        rate = (self.critic_lr, self.critic_max_norm)
+        critics, critic_opt, (loss, q) = descend(critic_error, given, state.critic_opt, *rate)
 
-        def move_policy():
-            actor, target_actor, target_critics, actor_opt = moving
-            gradient = eqx.filter_grad(actor_loss)(actor, critics[0], batch)
-            actor, actor_opt = adam(actor, gradient, actor_opt, self.actor_lr, self.actor_max_norm)
-            targets = (target_actor, target_critics)
-            return actor, *polyak(targets, (actor, critics), self.tau), actor_opt
+        def moved():
+            given, rate = (state.actor, critics[0], batch), (self.actor_lr, self.actor_max_norm)
+            actor, opt, _ = descend(actor_loss, given, state.actor_opt, *rate)
+            targets = (state.target_actor, state.target_critics)
+            return actor, opt, *polyak(targets, (actor, critics), self.tau)
 
-        if self.policy_delay > 1:
-            due = state.step % self.policy_delay == 0
-            moving = jax.lax.cond(due, move_policy, lambda: moving)
-        else:
-            moving = move_policy()
-        after: Any = (moving[0], critics, *moving[1:], critic_opt, state.step + 1, state.agents)
-        return TD3State(*after), {"critic_loss": critic_loss, "q": q}
+        moving = (state.actor, state.actor_opt, state.target_actor, state.target_critics)
+        due = state.step % self.policy_delay == 0
+        moving = jax.lax.cond(due, moved, lambda: moving) if self.policy_delay > 1 else moved()
+        names = ("actor", "actor_opt", "target_actor", "target_critics")
+        after = dict(zip(names, moving, strict=True)) | {"step": state.step + 1}
+        state = replace(state, critics=critics, critic_opt=critic_opt, **after)
+        return state, {"critic_loss": loss, "q": q}
 
     def bellman_target(
         self, state: TD3State, batch: Batch, *, key: PRNGKeyArray
@@ -211,8 +206,8 @@ def critic_error(
 
 def actor_loss(
     actor: AbstractPolicy, critic: AbstractCriticNetwork, batch: Batch
-) -> Float[Array, ""]:
+) -> tuple[Float[Array, ""], None]:
     """Minus the value of what the actor would do (deterministic policy gradient)."""
     actions = (act(actor, batch.obs), batch.action)
     q = critic.own(features_first(batch.obs), *map(features_first, actions))
-    return -mean(q, batch.active)
+    return -mean(q, batch.active), None

@@ -51,7 +51,8 @@ class DMMU(AbstractNetwork):
     """Hidden activations h: of every agent, or one number for each. An agent whose number is not
     that of the memory cells learns an encoder and a decoder; for the others both are the identity.
     """
-    memory: int | None = eqx.field(static=True, default=None)  # shared cells; None: the most hidden
+    memory: int | None = eqx.field(static=True, default=None)
+    """Shared memory cells, at least 1; None: the most hidden."""
     order: Literal["sequential", "simultaneous", "random"] = eqx.field(
         static=True, default="sequential"
     )
@@ -61,8 +62,10 @@ class DMMU(AbstractNetwork):
     access: Literal["everyone", "present", "acting"] = eqx.field(static=True, default="present")
     """Who reads and writes. `present`: who is not away, so also who is busy (as coded). `acting`:
     only who can act. `everyone`: always all; then observations end without a status."""
-    initializer: str = eqx.field(static=True, default="fan_in")  # normal, fan_in or kaiming
-    bias_std: float = eqx.field(static=True, default=0.1)  # of fresh biases, times that of weights
+    initializer: str = eqx.field(static=True, default="fan_in")
+    """Fresh weights: normal, fan_in or kaiming."""
+    bias_std: float = eqx.field(static=True, default=0.1)
+    """Standard deviation of fresh biases, times that of weights."""
     start_weights: Literal["drawn", "shut"] = eqx.field(static=True, default="drawn")
     """`shut`: MMUs' write gates start with biases lowered by 20. Else what all agents write at
     random drowns what an agent is told itself. Evolution may open them; an MMU that starts

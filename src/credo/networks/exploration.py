@@ -25,7 +25,7 @@ class AbstractNoise(eqx.Module):
 class GaussianNoise(AbstractNoise):
     """Independent N(0, std), as TD3 explores."""
 
-    std: float = 0.1
+    std: float = 0.1  # standard deviation, in units of actions, at least 0
 
     def __check_init__(self):
         require.at_least("std", self.std, 0)
@@ -38,9 +38,9 @@ class OrnsteinUhlenbeck(AbstractNoise):
     """Correlated noise, as DDPG explores (Uhlenbeck & Ornstein 1930, in discrete time), from 0 at
     the start of each episode. The author's code never reset it, and scaled it by 0.3."""
 
-    theta: float = 0.15  # share of the way back to 0 per step
-    sigma: float = 0.2  # std of what each step adds
-    scale: float = 0.3  # of the whole
+    theta: float = 0.15  # share of the way back to 0 per step, in [0, 1]
+    sigma: float = 0.2  # standard deviation of what each step adds, at least 0
+    scale: float = 0.3  # factor of the whole noise, in units of actions
 
     def __check_init__(self):
         require.within("theta", self.theta, 0, 1)

@@ -27,14 +27,17 @@ EPSILON = 1e-6  # of LayerNorm, relative to the variance
 class MLP(AbstractNetwork):
     """Config of a multi-layer perceptron."""
 
-    hidden: tuple[int, ...] = eqx.field(static=True, default=(20,))  # units of each hidden layer
-    activation: str = eqx.field(static=True, default="tanh")  # of the hidden layers
+    hidden: tuple[int, ...] = eqx.field(static=True, default=(20,))
+    """Units of each hidden layer, at least 1."""
+    activation: str = eqx.field(static=True, default="tanh")  # activation of the hidden layers
     normalization: Literal["none", "before", "after"] = eqx.field(static=True, default="none")
     """LayerNorm of the hidden layers, before their activation or after it."""
     output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="tanh")
-    output_scale: float = eqx.field(static=True, default=1.0)  # of the fresh output layer
+    """Activation of the output layer."""
+    output_scale: float = eqx.field(static=True, default=1.0)
+    """Scale of the fresh output layer's weights, above 0."""
     initializer: str = eqx.field(static=True, default="normal")
-    """normal, fan_in, kaiming, or uniform: U(±fan_in^-1/2), what PyTorch does."""
+    """Fresh weights: normal, fan_in, kaiming, or uniform: U(±fan_in^-1/2), what PyTorch does."""
 
     def __check_init__(self):
         _check(self)
@@ -116,14 +119,17 @@ class AbstractCriticNetwork(eqx.Module):
 class Critic(AbstractCritic):
     """A multi-layer perceptron."""
 
-    hidden: tuple[int, ...] = eqx.field(static=True, default=(256, 256))  # units of each layer
+    hidden: tuple[int, ...] = eqx.field(static=True, default=(256, 256))
+    """Units of each hidden layer, at least 1."""
     branches: tuple[int, ...] = eqx.field(static=True, default=())
     """Units of two layers of their own for state and action, whose outputs are joined; none: state
     and action go into the first hidden layer together."""
-    activation: str = eqx.field(static=True, default="relu")
+    activation: str = eqx.field(static=True, default="relu")  # activation of the hidden layers
     normalization: Literal["none", "before", "after"] = eqx.field(static=True, default="none")
-    output_scale: float = eqx.field(static=True, default=1.0)  # of the fresh output layer
-    initializer: str = eqx.field(static=True, default="uniform")  # as in MLP
+    """LayerNorm: none, or before or after the activation."""
+    output_scale: float = eqx.field(static=True, default=1.0)
+    """Scale of the fresh output layer's weights, above 0."""
+    initializer: str = eqx.field(static=True, default="uniform")  # fresh weights, as in MLP
 
     def __check_init__(self):
         _check(self)
@@ -171,8 +177,8 @@ class ResidualCritic(AbstractCritic):
     Regularized, Optimistic", section 3). Its other parts (optimism, quantiles, resets, decay of
     weights) are left out."""
 
-    width: int = eqx.field(static=True, default=256)  # units of every layer
-    blocks: int = eqx.field(static=True, default=2)
+    width: int = eqx.field(static=True, default=256)  # units of every layer, at least 1
+    blocks: int = eqx.field(static=True, default=2)  # residual blocks, at least 0
 
     def __check_init__(self):
         require.at_least("width", self.width, 1)

@@ -39,17 +39,28 @@ STARTS = ("drawn", "saturated", "closed", "open")
 class MMU(AbstractNetwork):
     """Config of an MMU. All sizes are independent once encoder and decoder are learned."""
 
-    hidden: int = eqx.field(static=True, default=5)  # hidden activations h
-    memory: int | None = eqx.field(static=True, default=None)  # memory cells; None: as hidden
-    alpha: float = eqx.field(static=True, default=0.0)  # 0 cumulative … 1 interpolative update
+    hidden: int = eqx.field(static=True, default=5)  # hidden activations h, at least 1
+    memory: int | None = eqx.field(static=True, default=None)
+    """Memory cells, at least 1; None: as many as hidden."""
+    alpha: float = eqx.field(static=True, default=0.0)
+    """In [0, 1]. 0: what is written is added to memory; 1: it takes the place of as much as the
+    write gate opens; between: a mixture."""
     encoder: Literal["identity", "learned"] = eqx.field(static=True, default="identity")
+    """What writes to memory: the hidden activations, or a learned matrix of them."""
     decoder: Literal["identity", "learned"] = eqx.field(static=True, default="identity")
-    block_activation: str = eqx.field(static=True, default="sigmoid")  # φ of equation 3.1
-    decoder_activation: str = eqx.field(static=True, default="identity")  # θ of equation 3.2
-    encoder_activation: str = eqx.field(static=True, default="tanh")  # θ of equation 3.4
+    """What is read: memory cells, or a learned matrix of them."""
+    block_activation: str = eqx.field(static=True, default="sigmoid")
+    """Activation φ of equation 3.1: hidden activations."""
+    decoder_activation: str = eqx.field(static=True, default="identity")
+    """Activation θ of equation 3.2: what is read."""
+    encoder_activation: str = eqx.field(static=True, default="tanh")
+    """Activation θ of equation 3.4: what is written."""
     output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
+    """Activation of the output layer."""
     start_memory: Literal["learned", "zero"] = eqx.field(static=True, default="learned")
-    initializer: str = eqx.field(static=True, default="normal")  # normal, fan_in or kaiming
+    """Memory at the first step: learned, or zeros."""
+    initializer: str = eqx.field(static=True, default="normal")
+    """Fresh weights: normal, fan_in or kaiming."""
     start_weights: Literal["drawn", "saturated", "closed", "open"] = eqx.field(
         static=True, default="drawn"
     )

@@ -29,9 +29,12 @@ class Recurrent(AbstractNetwork):
     """Config of a recurrent network with one layer."""
 
     cell: Literal["rnn", "gru", "lstm"] = eqx.field(static=True, default="lstm")
-    hidden: int = eqx.field(static=True, default=5)  # units (LSTM: cells)
+    """Rnn (Elman), gru, or lstm."""
+    hidden: int = eqx.field(static=True, default=5)  # units (of an LSTM cells), at least 1
     output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
-    initializer: str = eqx.field(static=True, default="normal")  # normal, fan_in or kaiming
+    """Activation of the output layer."""
+    initializer: str = eqx.field(static=True, default="normal")
+    """Fresh weights: normal, fan_in or kaiming."""
 
     def __check_init__(self):
         require.choice("cell", self.cell, GATES)

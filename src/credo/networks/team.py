@@ -35,12 +35,15 @@ class Team(AbstractNetwork):
 
     team: ClassVar[bool] = True
 
-    trunk: tuple[int, ...] = eqx.field(static=True, default=(100, 100))  # units of its layers
+    trunk: tuple[int, ...] = eqx.field(static=True, default=(100, 100))
+    """Units of each layer that agents share, at least 1."""
     head: AbstractNetwork = MLP(hidden=(), initializer="uniform")
     """What stands on the trunk; with memory, such as MMU, it can be evolved only."""
     sharing: Literal["trunk", "everything", "nothing"] = eqx.field(static=True, default="trunk")
-    activation: str = eqx.field(static=True, default="tanh")  # of the trunk
-    initializer: str = eqx.field(static=True, default="uniform")  # of the trunk, as in MLP
+    """What agents share: trunk, everything or nothing."""
+    activation: str = eqx.field(static=True, default="tanh")  # activation of the trunk
+    initializer: str = eqx.field(static=True, default="uniform")
+    """Fresh weights of the trunk, as in MLP."""
 
     def __check_init__(self):
         for i, units in enumerate(self.trunk):
@@ -160,7 +163,7 @@ class Centralized(AbstractNetwork):
 
     team: ClassVar[bool] = True
 
-    network: AbstractNetwork = MLP(hidden=(300,))
+    network: AbstractNetwork = MLP(hidden=(300,))  # the network that acts for all agents
 
     def init(
         self, obs_size: int, action_size: int, agents: int = 1, *, key: PRNGKeyArray
@@ -192,7 +195,7 @@ class JointCritic(AbstractCritic):
 
     joint: ClassVar[bool] = True
 
-    critic: Critic = Critic(hidden=(128, 128))  # of each agent
+    critic: Critic = Critic(hidden=(128, 128))  # the critic of each agent
 
     def init(self, obs_size, action_size, agents=1, *, key):
         networks = eqx.filter_vmap(

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text as Words
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
 from matplotlib.transforms import offset_copy
 from numpy.typing import NDArray
 
@@ -34,8 +34,9 @@ Plot = Figure | HeatMap | Tracks
 Looks = Mapping[str, Look]  # of curves, by label
 
 WIDTH, HEIGHT = 4.8, 3.1  # inches, without the legend
-MOST_POINTS = 400  # drawn per line
-MOST_SEED_POINTS = 24_000  # drawn per figure by the lines of single seeds
+LINE = 1.8  # points
+MOST_POINTS = 250  # drawn per line
+MOST_SEED_POINTS = 4_000  # drawn per figure by the lines of single seeds
 MOST_TIPS = 100  # points of a curve that a tooltip tells of
 FEW_POINTS = 25  # are marked
 RESAMPLES = 500  # of a curve's interval, for every point at once
@@ -95,8 +96,9 @@ def note(figure: Plot) -> str:
             f"{centre.capitalize()} over {count} runs. {band}: its 95 % bootstrap interval. "
             f"{each}: each run."
         ]
-    names = [curve.label for curve in figure.curves]
-    parts += [f"{' and '.join(names[i] for i in group)} coincide." for group in coinciding(figure)]
+    for group in coinciding(figure):
+        *others, last = [figure.curves[i].label for i in group]
+        parts.append(f"{', '.join(others)} and {last} coincide.")
     longest = max(np.shape(curve.x)[0] for curve in figure.curves)
     if longest > drawn_points(figure):
         parts.append(f"Up to {drawn_points(figure)} of {longest:,} points are drawn, unsmoothed.")
@@ -117,7 +119,8 @@ def coinciding(figure: Figure) -> list[list[int]]:
             other = drawn[group[0]]
             inside = (curve.x >= other.x[0]) & (curve.x <= other.x[-1])
             apart = np.abs(curve.centre - np.interp(curve.x, other.x, other.centre))[inside]
-            if 2 * len(apart) >= len(curve.x) > 1 and np.mean(apart <= near) >= 0.9:
+            apart, count = apart[np.isfinite(apart)], np.isfinite(curve.centre).sum()
+            if 2 * len(apart) >= count > 0 and np.mean(apart <= near) >= 0.9:
                 group.append(i)
                 break
         else:
@@ -200,14 +203,14 @@ def compact(tag: str, prefix: str) -> str:
     tag = re.sub(r'\b(id="|xlink:href="#|url\(#)', rf"\g<1>{prefix}", tag)
     tag = tag.replace("xlink:href", "href").replace("base64,\n", "base64,")
     tag = re.sub(r"font-family: [^;\"]*", f"font-family: {FONT}", tag)
-    return re.sub(r"(\.\d)\d+", r"\1", tag) if tag.startswith("<path") else tag
+    return re.sub(r"(\.\d)\d+| \n", r"\1", tag) if tag.startswith("<path") else tag
 
 
 # ------------------------------------------------------------------------------------ drawing
 
 
 def draw(figure: Plot, theme: Theme, looks: Looks | None = None, legend: bool = True) -> Canvas:
-    """The figure on a canvas of its own, with no title. Arguments as of `figure_svg`."""
+    """The figure on a canvas of its own, with no title. Arguments as of `picture`."""
     canvas = Canvas(figsize=(WIDTH, HEIGHT), layout="constrained")
     FigureCanvasAgg(canvas)  # measures text; saving as SVG brings its own
     axes = canvas.add_subplot()
@@ -244,12 +247,12 @@ def draw_curves(
             color=theme.curves[looks[curve.label].color],
             dashes=DASHES[looks[curve.label].dash],
             # Of curves that coincide each is drawn inside the one before.
-            width=1.8 + 2.0 * sum(inside),
+            width=LINE + 2.0 * sum(inside),
             transform=offset_copy(axes.transData, fig=canvas, x=shift, units="points"),
         )
         lines.append(draw_curve(axes, i, curve, figure, look))
     axes.grid(axis="y", color=theme.grid)
-    axes.margins(x=0.02 if figure.joined else 0.06)
+    axes.margins(x=0.02)
     scale(axes, figure)
     for line in figure.references:
         axes.axhline(line.value, color=theme.muted, linewidth=1, dashes=(4, 3), zorder=1.5)
@@ -268,6 +271,8 @@ def scale(axes: Axes, figure: Figure) -> None:
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     elif not figure.joined and len(places) <= 9:
         axes.set_xticks(places)
+        beside = 0.06 * (places[-1] - places[0]) or 0.5  # room for dots that are moved aside
+        axes.set_xlim(places[0] - beside, places[-1] + beside)
     elif np.all(places == np.round(places)):
         axes.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=[1, 2, 2.5, 5, 10]))
     if figure.y_range is not None:
@@ -287,13 +292,19 @@ class Drawing:
     width: float  # points
     transform: Any
 
+    @property
+    def pattern(self) -> list[float]:
+        """The dashes in widths of this line, as long as those of any other."""
+        return [x * LINE / self.width for x in self.dashes]
+
 
 def draw_curve(axes: Axes, index: int, curve: Curve, figure: Figure, look: Drawing) -> Line2D:
     """Runs, interval and centre of one curve, whose ids begin with `curve-index-`; the line that
     stands for it in the legend."""
     shown = sampled(curve, figure.centre, figure.log_x, drawn_points(figure))
     several = sum(np.shape(other.runs)[0] for other in figure.curves) > 20
-    marker = {"marker": "o", "ms": 2.0 + look.width} if len(shown.x) <= FEW_POINTS else {}
+    few = np.isfinite(shown.centre).sum() <= FEW_POINTS
+    marker = {"marker": "o", "ms": 2.0 + look.width} if few else {}
     artists: list[Artist] = []
     if len(shown.runs) > 1 and figure.joined:
         thin: dict[str, Any] = {"lw": 0.6, "alpha": 0.2 if several else 0.35, "zorder": 2}
@@ -308,7 +319,7 @@ def draw_curve(axes: Axes, index: int, curve: Curve, figure: Figure, look: Drawi
         artists.append(axes.vlines(shown.x, shown.low, shown.high, **bars, **beside))
     (line,) = axes.plot(
         *(shown.x, shown.centre),
-        **{"color": look.color, "lw": look.width, "dashes": look.dashes, "zorder": 3, **marker},
+        **{"color": look.color, "lw": look.width, "dashes": look.pattern, "zorder": 3, **marker},
         **({} if figure.joined else {"alpha": 0.9}),
         **beside,
         label=textwrap.fill(curve.label, 56),
@@ -332,7 +343,7 @@ class Sampled:
 def drawn_points(figure: Figure) -> int:
     """Points per line, so that many lines do not make a heavy page."""
     lines = sum(np.shape(curve.runs)[0] for curve in figure.curves)
-    return int(np.clip(MOST_SEED_POINTS // lines, 100, MOST_POINTS))
+    return int(np.clip(MOST_SEED_POINTS // lines, 40, MOST_POINTS))
 
 
 @lru_cache(maxsize=64)
@@ -355,15 +366,9 @@ def sampled(curve: Curve, centre: str, log_x: bool, points: int) -> Sampled:
 
 def shorten_ticks(axis: Axis, always: bool = False) -> None:
     """20k and 1M for 20000 and 1e6."""
-    if always or np.abs(axis.get_view_interval()).max() >= 1e4:
-        axis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))
-
-
-def short_number(value: float) -> str:
-    for size, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(value) >= size:
-            return f"{value / size:g}{suffix}".replace("-", "−")
-    return f"{value:g}".replace("-", "−")
+    low, high = np.sort(np.abs(axis.get_view_interval()))
+    if high >= 1e4 or (always and low >= 0.5):  # thousandths would get a unit too
+        axis.set_major_formatter(EngFormatter(sep=""))
 
 
 def add_legend(canvas: Canvas, handles: Sequence[Artist], theme: Theme) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
+import markupsafe
 import numpy as np
 
 from ..runs import files
@@ -50,6 +51,7 @@ def markdown(page: Page, folder: str | os.PathLike[str]) -> Path:
     folder = Path(folder)
     parts = drawn(page, legend=True)
     text = _template("page.md").render(page=page, parts=parts, width=round(100 * figures.WIDTH))
+    text = re.sub(r"\n{3,}", "\n\n", re.sub(r" +\n", "\n", text))
     pictures = {
         f"figure-{part.number}-{theme}.svg": f"{getattr(part, theme)}\n"
         for part in parts
@@ -191,10 +193,21 @@ def hidden_runs(table: Table) -> list[tuple[str, str, str]]:
     ]
 
 
-def escape_markdown(text: object) -> str:
-    """Text in a line of Markdown, or a cell of its table: nothing in it is markup."""
-    line = html.escape(" ".join(str(text).split()), quote=False)
-    line = re.sub(r"([\\`*\[\]|$~]|(?<!\w)_|_(?!\w))", r"\\\1", line)
+def prose(text: str) -> markupsafe.Markup:
+    """Text in HTML, with `code` between backticks."""
+    return markupsafe.Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(html.escape(text))))
+
+
+def markdown_prose(text: str) -> str:
+    """Text in a line of Markdown, with `code` between backticks."""
+    parts = re.split(r"(`[^`]+`)", " ".join(text.split()))
+    return "".join(part if i % 2 else markdown_text(part) for i, part in enumerate(parts))
+
+
+def markdown_text(text: object) -> str:
+    """Text in Markdown, or in a cell of its table: nothing in it is markup."""
+    line = html.escape(re.sub(r"\s+", " ", str(text)), quote=False)
+    line = re.sub(r"([\\`*|$~]|\](?=[(\[:])|(?<!\w)_|_(?!\w))", r"\\\1", line)
     return re.sub(r"^(\d*)([#+.)-])(?=[# ])", r"\1\\\2", line)  # a heading or an item
 
 
@@ -214,11 +227,12 @@ def _template(name: str) -> jinja2.Template:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"md": escape_markdown, "fenced": fenced, "shown": shown}
+    environment.filters |= {"md": markdown_text, "md_prose": markdown_prose, "prose": prose}
+    environment.filters |= {"fenced": fenced, "shown": shown}
     environment.globals |= {
         "numeric": numeric,
         "hidden_runs": hidden_runs,
         "TALL": TALL,
-        "dashes": [" ".join(f"{1.8 * x:g}" for x in dash) for dash in DASHES],
+        "dashes": [" ".join(f"{figures.LINE * x:g}" for x in dash) for dash in DASHES],
     }
     return environment.get_template(name)

@@ -4,7 +4,6 @@ It reads what runs have recorded: no environment is opened, and no code that a r
 imported but Credo's own. So a page about a stranger's run needs no trust in them.
 """
 
-import itertools
 import json
 import pathlib
 import shlex
@@ -13,17 +12,17 @@ from typing import Any
 
 import numpy as np
 
+from ..algorithms.lineage import MAKERS
 from ..analysis import attribution, floors
 from ..environments.base import AbstractSequenceTask
 from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
-from ..evolution.lineage import MAKERS
 from ..learners.base import AbstractLearner
 from ..runs import config
 from ..runs.record import RunError
 from ..runs.store import Run
 from .pages import write as write_page
-from .sections import Curve, Figure, Page, Reference, Section, Summary, Table
+from .sections import Cell, Curve, Figure, Page, Reference, Section, Summary, Table
 
 Tree = Mapping[str, Any]  # of a record: an object as `config.to_tree` makes it
 Groups = Mapping[str, list[Run]]  # runs that differ in their seed alone, by label
@@ -99,7 +98,10 @@ def _once(texts: Iterable[str]) -> list[str]:
 
 
 def _lead(runs: Sequence[Run]) -> str:
-    tasks = {config.brief(run.config["algorithm"]["env"]) for run in runs}
+    tasks = {
+        str(tree["id"]) if "id" in tree else config.brief(tree)
+        for tree in (run.config["algorithm"]["env"] for run in runs)
+    }
     return f"Task: {'; '.join(sorted(tasks))}."
 
 
@@ -149,20 +151,16 @@ def group_labels(trees: Sequence[Tree]) -> list[str]:
 
 
 def telling(flat: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The fewest fields, at most three, by which settings can be told apart, or nearly so."""
-    keys = differing(flat)
+    """At most three fields by which settings can be told apart, or nearly so."""
 
     def kinds(fields: Sequence[str]) -> int:
         return len({tuple(str(tree.get(key)) for key in fields) for tree in flat})
 
-    # Of many fields, the pairs and triples of those that tell most.
-    keys = sorted(keys, key=lambda key: -kinds([key]))[:12]
-    choices = [
-        fields
-        for size in range(1, MOST_FIELDS + 1)
-        for fields in itertools.combinations(keys, size)
-    ]
-    return list(max(choices, key=lambda fields: (kinds(fields), -len(fields))))
+    found: list[str] = []
+    keys = differing(flat)
+    while keys and len(found) < MOST_FIELDS and kinds(found) < len(flat):
+        found.append(max(keys, key=lambda key: kinds([*found, key])))
+    return found
 
 
 def differing(flat: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -225,8 +223,8 @@ def _figure(runs: Groups, metric: str, title: str) -> Figure:
     curves = [_curve(label, group, metric, unit) for label, group in runs.items()]
     known = [_bounds(group[0]) for group in runs.values()] if metric == "champion_score" else []
     levels = dict.fromkeys(level for pair in known if pair for level in pair)
-    names = {"champion_score": "success" if levels else "return"}
-    return Figure(title, unit, names.get(metric, metric.replace("_", " ")), curves, tuple(levels))
+    names = {"champion_score": "success" if levels else "return", "fitness_max": "fitness"}
+    return Figure(title, unit, names.get(metric, metric), curves, tuple(levels))
 
 
 def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
@@ -237,7 +235,8 @@ def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
         length = min(len(c[unit]) for c in columns)
         values = np.stack([c[metric][:length] for c in columns])
         return Curve(label, columns[0][unit][:length], values)
-    grid = attribution.axis([min((c[unit] for c in columns), key=lambda x: x[-1])], 400)
+    grid = attribution.axis([min((c[unit] for c in columns), key=lambda x: x[-1])], 240)
+    grid = np.union1d(grid, [max(float(c[unit][0]) for c in columns)])  # where all have begun
     return Curve(label, grid, [attribution.on_grid(c[unit], c[metric], grid) for c in columns])
 
 
@@ -259,20 +258,22 @@ def _table(runs: Groups) -> Table:
     known = [_bounds(group[0]) for group in runs.values()]
     rows = []
     for (label, group), bounds in zip(runs.items(), known, strict=True):
-        low, high = bounds or (None, None)
-        seeds = [run.config["seed"] for run in group]
         scores = [float(run.metrics["champion_score"][-1]) for run in group]
+        score = Summary(scores, [run.config["seed"] for run in group])
         last = min(int(run.metrics["generation"][-1]) for run in group)
-        told = [f"{low.value:.3f} ({low.label.partition(': ')[2]})" if low else None]
-        told += [Summary(scores, seeds), high.value if high else None]
-        rows.append([label, len(group), last, *told])
-    columns = ["algorithm", "seeds", "generations", "baseline", "best policy", "upper bound"]
+        told: list[Cell] = [None, None]
+        if bounds is not None:
+            low, high = bounds
+            told = [f"{low.value:.3f} ({low.label.partition(': ')[2]})", high.value]
+        rows.append([label, score, *(told if any(known) else ()), len(group), last])
+    beside = ["baseline", "upper bound"] if any(known) else []
     caption = f"On {_episodes(runs)} fresh episodes; `credo evaluate` plays more."
-    if not any(known):
-        columns = [name for name in columns if name not in ("baseline", "upper bound")]
-        rows = [[*row[:3], row[4]] for row in rows]
-        caption += " No baseline and no upper bound of this task are known."
-    return Table("Score of the best policy, as last tested", columns, rows, caption)
+    return Table(
+        "Score of the best policy, as last tested",
+        ["algorithm", "best policy", *beside, "seeds", "generations"],
+        rows,
+        caption + ("" if beside else " No baseline and no upper bound of this task are known."),
+    )
 
 
 def _episodes(runs: Groups) -> str:
@@ -367,19 +368,19 @@ def learner_names(learners: Sequence[AbstractLearner | Tree]) -> list[str]:
 
 
 def _settings(runs: Groups) -> list[Table]:
-    """Settings that differ, and all of them, where those are marked."""
+    """Settings that several algorithms have and that differ; and all, where those are marked."""
     flat = [config.flatten(_indexed(group[0].config["algorithm"])) for group in runs.values()]
     keys = list(dict.fromkeys(key for tree in flat for key in tree))
-    marked = set(differing(flat))
+    unlike = {key for key in differing(flat) if sum(key in tree for tree in flat) > 1}
     rows = {key: [key, *(_text(tree[key]) if key in tree else "" for tree in flat)] for key in keys}
-    unlike = [rows[key] for key in keys if key in marked]
     columns = ["setting", *runs]
-    found = Table(
+    every = Table(
         "All settings",
         columns,
         list(rows.values()),
         caption="Marked: settings that differ." if unlike else "",
-        marked=[i for i, key in enumerate(keys) if key in marked],
+        marked=[i for i, key in enumerate(keys) if key in unlike],
         folded=True,
     )
-    return [Table("Settings that differ", columns, unlike), found] if unlike else [found]
+    few = Table("Settings that differ", columns, [rows[key] for key in keys if key in unlike])
+    return [few, every] if unlike else [every]

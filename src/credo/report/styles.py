@@ -1,7 +1,7 @@
 """Colours and dashes: of the page, by theme, and of methods, the same on every page."""
 
-import itertools
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,32 +60,16 @@ class Look(NamedTuple):
     dash: int
 
 
-# Hybrids and networks that are often compared are solid lines, gradient alone is dashed, evolution
-# alone dashed and dotted. No two methods look the same.
+# No two methods look the same, and those that are often compared differ in colour.
+_GRID = (  # a row for each of the first dashes, a column for each colour
+    ("dmmu", "erl", "mmu", "cerl", "lstm", "gru", "merl"),
+    ("td3", "cnf", "neuroevolution", "lstmsm", "sac", "ddpg", "ppo"),
+    ("bptt", "rnn", "ea", "ccea", "matd3", "maddpg", "mlp"),
+)
 METHODS = {
-    "merl": Look(0, 0),
-    "erl": Look(1, 0),
-    "mmu": Look(2, 0),
-    "cerl": Look(3, 0),
-    "lstm": Look(4, 0),
-    "dmmu": Look(5, 0),
-    "gru": Look(6, 0),
-    "td3": Look(0, 1),
-    "bptt": Look(1, 1),
-    "matd3": Look(2, 1),
-    "maddpg": Look(3, 1),
-    "sac": Look(4, 1),
-    "ddpg": Look(5, 1),
-    "ppo": Look(6, 1),
-    "rnn": Look(0, 2),
-    "lstmsm": Look(1, 2),
-    "ea": Look(2, 2),
-    "cnf": Look(3, 2),
-    "ccea": Look(4, 2),
-    "neuroevolution": Look(5, 2),
-    "mlp": Look(6, 2),
+    name: Look(color, dash) for dash, row in enumerate(_GRID) for color, name in enumerate(row)
 }
-ALIASES = {"gradient": "bptt", "evolution": "neuroevolution", "feed": "mlp"}
+ALIASES = {"gradient": "bptt", "evolution": "neuroevolution", "ff": "mlp", "feed": "mlp"}
 
 
 def method(label: str) -> str | None:
@@ -104,8 +88,10 @@ def assign(labels: Iterable[str]) -> Mapping[str, Look]:
         if known is not None and known not in looks.values():
             looks[name] = known
     colors, dashes = len(LIGHT.curves), len(DASHES)
-    free = (Look(i % colors, i % dashes) for i in range(colors * dashes))
-    spare = [look for look in free if look not in looks.values()] or [Look(0, 0)]
-    rest = [name for name in names if name not in looks]
-    looks |= dict(zip(rest, itertools.cycle(spare), strict=False))  # more than there are: again
+    every = [Look(i % colors, i % dashes) for i in range(colors * dashes)]
+    for name in names:
+        if name not in looks:  # of the rarest colour; more than there are begin again
+            used = Counter(look.color for look in looks.values())
+            free = [look for look in every if look not in looks.values()] or every
+            looks[name] = min(free, key=lambda look: used[look.color])
     return {name: looks[name] for name in names}

@@ -1,10 +1,7 @@
 """Paths of rovers as a figure (Figure 7.5 of the dissertation), and the pictures of a film."""
 
 import io
-import os
-import textwrap
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import matplotlib
@@ -17,9 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from ..environments.rover import Rover
-from ..runs import files
 from .figures import DARK, LIGHT, STYLE, Theme, inline
-from .replay_page import Episode
 
 SIDE = 4.2  # inches
 SEEN = {LIGHT: "#c8102e", DARK: "#ff6b78"}  # an observed POI
@@ -59,54 +54,36 @@ def trajectories(
     return inline(svg.getvalue(), f"{title}: {label}" if title else label, prefix)
 
 
-def save_png(
-    path: str | os.PathLike[str],
-    position: ArrayLike,
-    poi: ArrayLike,
-    observed: ArrayLike,
-    *,
-    activation_distance: float,
-    size: float,
-    title: str = "",
-    dark: bool = False,
-    dpi: int = 200,
-) -> Path:
-    """Write the figure of `trajectories`, with its title, to `path`; 840 pixels wide at 200 dpi."""
-    theme = DARK if dark else LIGHT
-    with matplotlib.rc_context(STYLE):
-        canvas = _drawn(position, poi, observed, activation_distance, size, dark)
-        if title:
-            canvas.set_figheight(SIDE + 0.3)
-            canvas.suptitle(textwrap.fill(title, 52), color=theme.ink, fontsize=11)
-        with files.whole(path) as draft:
-            canvas.savefig(draft, format="png", dpi=dpi, facecolor=theme.page)
-    return Path(path)
-
-
 def pictures(
-    env: Rover, episodes: Sequence[Episode], size: tuple[int, int], stride: int = 1
+    env: Rover,
+    shown: Mapping[str, np.ndarray],
+    name: str,
+    moments: Iterable[int],
+    size: tuple[int, int],
 ) -> Iterator[np.ndarray]:
-    """Pictures `[height, width, 3]`, uint8, of the start and the end of every episode and every
-    `stride`-th step between. `size`: width and height in pixels."""
+    """Pictures `[height, width, 3]`, uint8, of an episode at these moments.
+
+    **Arguments:** `shown`: what `Rover.shown` says of it; `name`: of the episode; `size`: width and
+    height in pixels.
+    """
     reach, side = (float(np.asarray(x)) for x in (env.activation_distance, env.size))
     width, height = size
     canvas = Canvas(figsize=(width / 100, height / 100), dpi=100, facecolor=LIGHT.page)
     agg = FigureCanvasAgg(canvas)
     left, bottom, top = min(0.2, 44 / width), min(0.2, 44 / height), 1 - min(0.2, 28 / height)
-    for episode in episodes:
-        last = len(episode.position) - 1
-        for t in [*range(0, last, stride), last]:
-            with matplotlib.rc_context(STYLE):
-                canvas.clear()
-                axes = canvas.add_axes((left, bottom, 0.98 - left, top - bottom))
-                _field(axes, episode.position, episode.poi, reach, side, LIGHT)
-                _pois(axes, episode.poi, episode.observed[t], reach, LIGHT)
-                _counts(axes, env, episode, t)
-                _paths(axes, episode.position[: t + 1], LIGHT, episode.heading[t])
-                text = f"{episode.name}, step {t} of {last}: global reward {episode.share[t]:.2f}"
-                axes.set_title(text, color=LIGHT.ink, fontsize=9.5)
-                agg.draw()
-            yield np.array(agg.buffer_rgba())[:, :, :3]
+    position, last = shown["position"], len(shown["position"]) - 1
+    for t in moments:
+        with matplotlib.rc_context(STYLE):
+            canvas.clear()
+            axes = canvas.add_axes((left, bottom, 0.98 - left, top - bottom))
+            _field(axes, position, shown["poi"], reach, side, LIGHT)
+            _pois(axes, shown["poi"], shown["observed"][t], reach, LIGHT)
+            _counts(axes, env, shown, t)
+            _paths(axes, position[: t + 1], LIGHT, shown["heading"][t])
+            text = f"{name}, step {t} of {last}: global reward {shown['share'][t]:.2f}"
+            axes.set_title(text, color=LIGHT.ink, fontsize=9.5)
+            agg.draw()
+        yield np.array(agg.buffer_rgba())[:, :, :3]
 
 
 def _drawn(position, poi, observed, reach: float, size: float, dark: bool) -> Canvas:
@@ -159,11 +136,10 @@ def _pois(axes: Axes, poi, observed, reach: float, theme: Theme) -> None:
         axes.plot(*place, marker="D", ms=6, mfc=fill, mec=color, mew=1.5, zorder=4)
 
 
-def _counts(axes: Axes, env: Rover, episode: Episode, t: int) -> None:
+def _counts(axes: Axes, env: Rover, shown: Mapping[str, np.ndarray], t: int) -> None:
     offset = {"textcoords": "offset points", "xytext": (0, -16), "ha": "center", "fontsize": 8}
-    for place, seen, inside in zip(
-        episode.poi, episode.observed[t], episode.inside[t], strict=True
-    ):
+    now = (shown["poi"], shown["observed"][t], shown["inside"][t])
+    for place, seen, inside in zip(*now, strict=True):
         text = "observed" if seen else f"{inside} of {env.coupling}"
         axes.annotate(text, place, color=SEEN[LIGHT] if seen else LIGHT.ink, zorder=5, **offset)
 

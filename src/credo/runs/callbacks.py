@@ -93,7 +93,11 @@ class WandB(Logger):
         """One step, in a tracked run that a resumed one goes on with."""
         if self.tracked is None:
             self.tracked = importlib.import_module("wandb").init(
-                dir=run.path, id=_identity(run), resume="allow", **_named(run)
+                dir=run.path,
+                id=_identity(run),
+                resume="allow",
+                settings={"console": "off"},  # the streams are ours
+                **_named(run),
             )
         self.tracked.log(_finite(metrics), step=generation)
 

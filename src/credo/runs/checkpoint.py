@@ -39,24 +39,16 @@ STATE, COUNTERS, COMMIT = "state.safetensors", "counters.json", "COMMIT"
 # Our entries in a file's metadata.
 KEYS, CHECKSUM, REPLAY = "credo.keys", "credo.sha256", "credo.replay"
 EXTRA = "extra"  # before the names of leaves besides the state's, which begin with "." or "["
-DTYPES = {
-    np.dtype(dtype): code
-    for dtype, code in {
-        jnp.bool_: "BOOL",
-        jnp.int8: "I8",
-        jnp.int16: "I16",
-        jnp.int32: "I32",
-        jnp.int64: "I64",
-        jnp.uint8: "U8",
-        jnp.uint16: "U16",
-        jnp.uint32: "U32",
-        jnp.uint64: "U64",
-        jnp.float16: "F16",
-        jnp.bfloat16: "BF16",
-        jnp.float32: "F32",
-        jnp.float64: "F64",
-    }.items()
+CODES = {
+    "bool": "BOOL",
+    **{f"int{bits}": f"I{bits}" for bits in (8, 16, 32, 64)},
+    **{f"uint{bits}": f"U{bits}" for bits in (8, 16, 32, 64)},
+    "float16": "F16",
+    "bfloat16": "BF16",
+    "float32": "F32",
+    "float64": "F64",
 }
+DTYPES = {np.dtype(jnp.dtype(name)): code for name, code in CODES.items()}
 
 
 class CheckpointError(Exception):

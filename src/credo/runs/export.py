@@ -18,16 +18,20 @@ from .store import Run
 Weights = dict[str, np.ndarray]
 
 
-def export(run: Run, path: str | pathlib.Path) -> pathlib.Path:
-    """Write a run's champion to one safetensors file, for `credo.runner.Runner.load`.
+def export(run: Run, path: str | pathlib.Path, *, best: bool = False) -> pathlib.Path:
+    """Write a run's champion, or its `best` policy, to one safetensors file, for
+    `credo.runner.Runner.load`.
 
     Its metadata describe the network, the sizes and, for a task of Gymnasium or PettingZoo, the
     action space, so that the runner acts in the environment's own units. The run's record tells
     them: no environment is opened. What was at `path` is replaced.
 
-    **Raises:** `RunError` if the network is none of Credo's.
+    **Raises:** `RunError` if the network is none of Credo's, or the folder is not there.
     """
-    path, policy = pathlib.Path(path), champion(run)
+    path = pathlib.Path(path)
+    if not path.parent.is_dir():
+        raise RunError(f"{path.parent} is no folder: make it first, or name another file")
+    policy = champion(run, best=best)
     network, weights = parts_of(policy)
     description = json.dumps(_describe(run, network))
     metadata = {DESCRIPTION: description, FINGERPRINT: fingerprint(description, weights)}

@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from . import files
+from .config import to_tree
 from .lock import is_lock, lock
+from .names import run_name
 from .record import NAME, RunError
 
 DRAFT = re.compile(r"\.config\.json\.draft(\.json)?")
@@ -33,9 +35,9 @@ def runs_in(path: str | pathlib.Path) -> list[pathlib.Path]:
 
 
 def free_name(algorithm: Any, seed: int | str, label: str = "") -> pathlib.Path:
-    """A folder that does not exist. `label`: what stands before the seed; by default the names of
-    the algorithm and the task."""
-    label = label or f"{type(algorithm).__name__}-{type(algorithm.env).__name__}"
+    """A folder that does not exist. `label`: what stands before the seed; by default the words for
+    the algorithm and the task (`names.run_name`)."""
+    label = label or run_name(to_tree(algorithm))
     name = re.sub(r"[^\w.]+", "-", f"{label}-{seed}".lower())
     path, copies = pathlib.Path("runs") / name, 1
     while path.exists():

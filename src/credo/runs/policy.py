@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ..compilation import float32
-from ..environments.wrappers import DelayedHostReward, DelayedReward
 from ..networks.normalized import Normalized
 from ..networks.team import Team
 from ..runner import Units
@@ -108,13 +107,6 @@ def _units(run: Any) -> Units:
             f"{run.path / 'config.json'} is damaged: its task cannot be read "
             f"({type(error).__name__}: {error}); restore it from a copy"
         ) from error
-
-
-def undelayed(env: Any) -> Any:
-    """The task itself, without what pays its rewards later."""
-    while isinstance(env, DelayedReward | DelayedHostReward):
-        env = env.env
-    return env
 
 
 def task_of(run: Any) -> Mapping[str, Any]:

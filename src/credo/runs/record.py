@@ -19,7 +19,7 @@ import json
 import os
 import pathlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from . import files, trust
@@ -53,6 +53,20 @@ def read(folder: pathlib.Path) -> Record:
         raise RunError(
             f"{folder} is not a run: it has no {NAME}; name a folder that `credo train` made"
         )
+    record = Record(_parsed(path))
+    record.path = path
+    _check(record)
+    if record.get(trust.CHECKSUM, _checksum(record)) != _checksum(record):
+        raise RunError(
+            f"{path} was changed after Credo wrote it (its checksum says so): restore it from a "
+            "copy. The settings of a run are changed by `credo resume RUN --set NAME=VALUE`, its "
+            "budget by --generations and --frames"
+        )
+    return record
+
+
+def _parsed(path: pathlib.Path) -> dict[str, Any]:
+    """What is in the file, as JSON."""
     try:
         content = json.loads(files.read_text(path))
     except OSError as error:
@@ -62,27 +76,24 @@ def read(folder: pathlib.Path) -> Record:
         raise RunError(f"{told}; restore it from a copy") from error
     if not isinstance(content, dict):
         raise RunError(f"{path} is damaged: it is no JSON object; restore it from a copy")
-    if unknown := sorted(set(content) - set(FIELDS)):
+    return content
+
+
+def _check(record: Record) -> None:
+    """Raise `RunError` if a field is unknown or of a wrong kind."""
+    if unknown := sorted(set(record) - set(FIELDS)):
         # A checksum under another name would protect nothing.
         raise RunError(
-            f"{path} has an entry {unknown[0]!r}, which this version of Credo does not write: "
-            "restore it from a copy if it is damaged, or install the newer version that made it"
+            f"{record.path} has an entry {unknown[0]!r}, which this version of Credo does not "
+            "write: restore it from a copy if it is damaged, or install the newer version that "
+            "made it"
         )
     for name, (right, what) in FIELDS.items():
-        if name in content and not right(content[name]):
+        if name in record and not right(record[name]):
             raise RunError(
-                f"{path} is damaged: {name!r} is {_brief(content[name])}: it must be {what}; "
+                f"{record.path} is damaged: {name!r} is {_brief(record[name])}: it must be {what}; "
                 "restore it from a copy"
             )
-    if content.get(trust.CHECKSUM, _checksum(content)) != _checksum(content):
-        raise RunError(
-            f"{path} was changed after Credo wrote it (its checksum says so): restore it from a "
-            "copy. The settings of a run are changed by `credo resume RUN --set NAME=VALUE`, its "
-            "budget by --generations and --frames"
-        )
-    record = Record(content)
-    record.path = path
-    return record
 
 
 def write(folder: pathlib.Path, record: dict[str, Any], *, sign: bool = True) -> None:
@@ -176,77 +187,73 @@ def _brief(value: Any) -> str:
 
 # What each field must be.
 
-
-def _number(value: Any, least: float = -float("inf")) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and not value < least
+Test = Callable[[Any], bool]
 
 
-def _whole(value: Any, least: int, most: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+def _is(*kinds: type) -> Test:
+    return lambda value: isinstance(value, kinds) and (bool in kinds or not isinstance(value, bool))
 
 
-def _is_object(value: Any) -> bool:
-    return isinstance(value, dict) and bool(CLASS.fullmatch(str(value.get("class"))))
+def _whole(least: int, most: int = 2**63 - 1) -> Test:
+    return lambda value: _is(int)(value) and least <= value <= most
 
 
-def _is_algorithm(value: Any) -> bool:
-    return _is_object(value) and _is_object(value.get("env"))
+def _maybe(test: Test) -> Test:
+    return lambda value: value is None or test(value)
+
+
+def _has(needed: Iterable[str] = (), /, **tests: Test) -> Test:
+    """An object with the needed entries; each that is tested passes, where it is there."""
+    return lambda value: (
+        isinstance(value, dict)
+        and set(needed) <= set(value)
+        and all(test(value[name]) for name, test in tests.items() if name in value)
+    )
+
+
+def _object(**tests: Test) -> Test:
+    named: dict[str, Test] = {"class": lambda value: CLASS.fullmatch(str(value)) is not None}
+    return _has(("class", *tests), **named, **tests)
 
 
 def _is_budget(value: Any) -> bool:
-    if not isinstance(value, dict) or set(value) - {"generations", "frames", "stop_at"}:
-        return False
-    limits = [value[name] for name in ("generations", "frames") if value.get(name) is not None]
-    score = value.get("stop_at")
-    whole = all(_whole(limit, 1, 2**63) for limit in limits)
-    return bool(limits) and whole and (score is None or _number(score))
+    limits: dict[str, Test] = {"generations": _maybe(_whole(1)), "frames": _maybe(_whole(1))}
+    right = _has(**limits, stop_at=_maybe(_is(int, float)))(value)
+    known = right and not set(value) - {*limits, "stop_at"}
+    return known and any(value.get(name) is not None for name in limits)
 
 
-def _is_machine(value: Any) -> bool:
-    if not isinstance(value, dict):
-        return False
-    texts = [value.get(name, "") for name in ("processor", "device", "system")]
-    versions = value.get("versions", {})
-    if not isinstance(versions, dict):
-        return False
-    named = all(isinstance(text, str) for text in [*texts, *versions.values()])
-    return named and _whole(value.get("cores", 1), 0, 2**31)
-
-
-def _is_task(value: Any) -> bool:
-    if not isinstance(value, dict):
-        return False
-    sizes = [value[name] for name in ("obs_size", "action_size", "agents") if name in value]
-    folder = value.get("folder")
-    known = all(size is None or _whole(size, 0, 2**31) for size in sizes)
-    return known and (folder is None or isinstance(folder, str))
+SIZE, TEXT = _maybe(_whole(0, 2**31)), _is(str)
+MACHINE: dict[str, Test] = {
+    "versions": lambda value: isinstance(value, dict) and all(map(TEXT, value.values())),
+    "cores": _whole(0, 2**31),
+    **dict.fromkeys(("processor", "device", "system"), TEXT),
+}
+CHANGE = _has(("generation",), generation=_whole(0))
 
 
 def _is_changes(value: Any) -> bool:
-    return isinstance(value, list) and all(
-        isinstance(change, dict) and _whole(change.get("generation"), 0, 2**63) for change in value
-    )
+    return isinstance(value, list) and all(map(CHANGE, value))
 
 
 def _is_hash(value: Any) -> bool:
     return isinstance(value, str) and re.fullmatch("[0-9a-f]+", value) is not None
 
 
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-FIELDS: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "algorithm": (_is_algorithm, 'an object with "class" and "env"'),
+FIELDS: dict[str, tuple[Test, str]] = {
+    "algorithm": (_object(env=_object()), 'an object with "class" and "env"'),
     # Older versions took seeds that JAX cuts to 32 bits.
-    "seed": (lambda value: _whole(value, -(2**63), 2**63 - 1), "a whole number"),
+    "seed": (_whole(-(2**63)), "a whole number"),
     "budget": (_is_budget, "generations and frames, whole numbers of at least 1, and stop_at"),
-    "options": (lambda value: isinstance(value, dict), "an object"),
-    "machine": (_is_machine, "versions, processor, cores, device and system"),
-    "task": (_is_task, "the sizes of the task and the folder it was found from"),
-    "warm_start": (_is_text, "the path of a run"),
+    "options": (_has(), "an object"),
+    "machine": (_has(**MACHINE), "versions, processor, cores, device and system"),
+    "task": (
+        _has(**dict.fromkeys(SIZES, SIZE), folder=_maybe(TEXT)),
+        "the sizes of the task and the folder it was found from",
+    ),
+    "warm_start": (TEXT, "the path of a run"),
     "changes": (_is_changes, "a list of objects, each with a generation"),
-    "resumable": (lambda value: isinstance(value, bool), "true or false"),
+    "resumable": (_is(bool), "true or false"),
     trust.CHECKSUM: (_is_hash, "a number in hexadecimal digits"),
     trust.SIGNATURE: (_is_hash, "a number in hexadecimal digits"),
 }

@@ -16,6 +16,7 @@ from ..environments.host import EnvironmentFailure
 from ..replay import shapes_alone
 from . import checkpoint, config, files, log, policy, record
 from .policy import Policy
+from .progress import best_of
 from .record import RunError
 from .trust import signed_here
 
@@ -25,10 +26,11 @@ CHAMPION, BEST = "champion.safetensors", "best.safetensors"
 class Run:
     """A run on disk, finished or not. Reading it changes nothing."""
 
-    def __init__(self, path: str | pathlib.Path, *, trust: bool = False):
+    def __init__(self, path: str | pathlib.Path, *, trust: bool = False, best: bool = False):
         """`trust`: whether classes and environments of somebody's own may be imported that a run
-        names which this user did not make. Raises `RunError`."""
-        self.path = pathlib.Path(path)
+        names which this user did not make. `best`: show the best policy wherever the champion is
+        meant. Raises `RunError`."""
+        self.path, self._shown = pathlib.Path(path), BEST if best else CHAMPION
         self.config = record.read(self.path)
         self.trusted = trust or signed_here(self.config)
 
@@ -56,10 +58,24 @@ class Run:
         return log.read(self.path / "metrics.csv")
 
     @property
+    def summary(self) -> str:
+        """How far it came, in a line."""
+        columns, settings = self.metrics, self.config["algorithm"]
+        row = {name: column[-1] for name, column in columns.items()}
+        best, value = best_of(row)
+        when = " at the last test" * (settings.get("test_every", 1) > 1)  # not of today's champion
+        episodes = settings.get("test_episodes")
+        when += f" on {episodes} fresh episodes" if episodes is not None else ""
+        return (
+            f"{self.path}: generation {int(row['generation'])}, {best} {value:.4g}, champion score "
+            f"{row['champion_score']:.4g}{when}"
+        )
+
+    @property
     def champion(self) -> PyTree:
         """The policy with the highest fitness of the last generation; of a learner alone, its
         actor. Raises `RunError` if it is another run's, or if the task has other sizes today."""
-        return self._opened(CHAMPION)
+        return self._opened(self._shown)
 
     @property
     def best(self) -> PyTree:
@@ -77,7 +93,7 @@ class Run:
     def restored(self, like: PyTree, *, best: bool = False) -> PyTree:
         """The champion, or the best policy, of which `like` has the structure. Raises as `champion`
         does."""
-        name = BEST if best else CHAMPION
+        name = BEST if best else self._shown
         self._metadata(name)
         return checkpoint.import_policy(self.path / name, like)
 

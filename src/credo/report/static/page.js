@@ -57,9 +57,8 @@
     if (told.share === null) return;
     const guide = plot.appendChild(document.createElement('div'));
     guide.className = 'guide';
-    guide.style.left = `${area.width * (left + width * told.share)}px`;
-    guide.style.top = `${area.height * top}px`;
-    guide.style.height = `${area.height * height}px`;
+    const percent = {left: left + width * told.share, top, height};
+    for (const name in percent) guide.style[name] = `${100 * percent[name]}%`;
   }
 
   for (const figure of document.querySelectorAll('figure[data-tips]')) {

@@ -42,7 +42,7 @@ function draw(time) {
     set(group, 'class', game.pending[t][j] ? '' : 'empty');
   });
   parts.servers.forEach(({group, body, text}, i) => {
-    const status = game.status[t][i], worth = t ? game.worth[t - 1][i] : null;
+    const status = game.status[t][i], worth = t && game.choice[t - 1][i] >= 0 ? game.worth[t - 1][i] : null;
     set(group, 'class', 'server ' + ['away', 'busy', 'acts'][status + 1] + (i === view.agent() ? ' chosen' : ''));
     body.style.fill = status === 1 ? color(i) : 'var(--page)';
     text.textContent = worth === null ? '' : worth > 0 ? '+1' : worth < 0 ? '\u22121' : '0';

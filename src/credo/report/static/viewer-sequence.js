@@ -1,7 +1,9 @@
 /* A sequence around the present step, and all of it below. */
 credo.draw(view => {
 const {field, panel, task, add, html, set, number, color} = view;
-const WIDE = 400, LEFT = 4, AROUND = 20, ROW = 46, rows = task.inputs.length + 1;
+/* On a phone fewer steps, larger. */
+const phone = field.clientWidth < 520, WIDE = phone ? 220 : 400, AROUND = phone ? 12 : 20;
+const LEFT = 4, ROW = 46, rows = task.inputs.length + 1;
 const now = html(panel, 'h2'), told = html(panel, 'p', {class: 'note'});
 let game, parts;
 

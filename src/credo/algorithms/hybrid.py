@@ -1,0 +1,259 @@
+"""Hybrids of evolution and gradient: what ERL, CERL and MERL share beside the breeder.
+
+A population and learners play into one replay buffer. A generation is a sequence of phases: `play`
+(the population), `breed`, `explore` (the learners), `improve` (the learners), `inject` (their
+actors into the population) and `tested` (the champion). Each takes a state and returns the next.
+"""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+
+from .. import require, rollout, tree
+from ..compilation import float32, jit, when
+from ..evolution.breeder import Breeder, draw
+from ..evolution.selection import rankable, ranking
+from ..learners.base import AbstractLearner, learn
+from ..learners.manager import UCB, AbstractManager, Ledger, even
+from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..normalization import Moments, behind, frozen, warmed, watched
+from ..replay import Replay, extend
+from ..rollout import Environment, blank, collect
+from ..types import Evaluation, Metrics
+from .fitness import objective
+from .lineage import Lineage
+
+
+class HybridState(eqx.Module):
+    """What a hybrid knows between two generations."""
+
+    population: PyTree  # leaves [k, ...]; bred, not yet evaluated
+    lineage: Lineage
+    learners: tuple[PyTree, ...]
+    replay: Any  # a Replay; None if there are no learners
+    ledger: Ledger
+    allocation: Int[Array, " b"]  # the learner of each rollout worker
+    champion: AbstractPolicy  # the fittest of the last generation
+    score: Float[Array, ""]  # of the champion that was tested last
+    frames: Int[Array, ""]
+    episodes: Int[Array, ""]
+    generation: Int[Array, ""]
+    moments: Moments | None  # of all observations; None: they are not normalised
+    seen: Moments | None  # the same with what was seen in this generation, in the midst of one
+
+
+class Hybrid(eqx.Module):
+    """An algorithm that evolves a population beside learners."""
+
+    env: eqx.AbstractVar[Environment]
+    network: eqx.AbstractVar[AbstractNetwork]
+    learners: eqx.AbstractVar[tuple[AbstractLearner, ...]]
+    population_size: eqx.AbstractVar[int]
+    breeder: eqx.AbstractVar[Breeder]
+    episodes: eqx.AbstractVar[int]
+    workers: eqx.AbstractVar[int]
+    manager: eqx.AbstractVar[AbstractManager | None]
+    redistribute: eqx.AbstractVar[bool]
+    updates_per_frame: eqx.AbstractVar[float]
+    warmup_frames: eqx.AbstractVar[int]
+    replay_capacity: eqx.AbstractVar[int]
+    test_episodes: eqx.AbstractVar[int]
+    test_every: eqx.AbstractVar[int]
+    fitness: eqx.AbstractVar[str | None]
+    normalize_observations: eqx.AbstractVar[bool]
+
+    def __check_init__(self):
+        for name in ("episodes", "workers", "replay_capacity", "test_episodes", "test_every"):
+            require.at_least(name, getattr(self, name), 1)
+        for name in ("updates_per_frame", "warmup_frames"):
+            require.at_least(name, getattr(self, name), 0)
+        require.fits(self.env, self.network, *self.learners)
+        for reward in (self.fitness, *(learner.signal for learner in self.learners)):
+            objective(self.env, reward)
+        q = len(self.learners)
+        self.breeder.check(self.population_size, self.network, learners=q)
+        if self.manager is None and self.workers < q:
+            raise ValueError(
+                f"{self.workers} workers for {q} learners: some would never play; give at least as "
+                "many"
+            )
+
+    @property
+    def elites(self) -> int:
+        """Members that are kept unchanged: e = int(ψ·k)."""
+        return self.breeder.elites(self.population_size)
+
+    @property
+    def reward(self) -> str:
+        """The reward that evolution maximises, and learners that name no other one."""
+        return objective(self.env, self.fitness)
+
+    @property
+    def rounds(self) -> int:
+        """Episodes of one generation."""
+        return self.population_size * self.episodes + bool(self.learners) * self.workers
+
+    @property
+    def most_frames(self) -> int:
+        """Frames of one generation, if every episode lasts until the time limit."""
+        return self.rounds * self.env.max_steps
+
+    @float32()
+    def init(self, *, key: PRNGKeyArray) -> HybridState:
+        """1-4: Initialize learners, a population of k actors, and an empty cyclic replay buffer."""
+        env, network, k, q = self.env, self.network, self.population_size, len(self.learners)
+        require.continuous(env, *self.learners)
+        population_key, *keys = jax.random.split(key, 1 + q)
+        pairs = zip(self.learners, keys, strict=True)
+        population = draw(network, env.sizes, k, key=population_key)
+        moments = Moments.first(env, network) if self.normalize_observations else None
+        return HybridState(
+            population=population,
+            lineage=Lineage.first(k, q),
+            learners=tuple(one.init(network, *env.sizes, key=key) for one, key in pairs),
+            replay=Replay.empty(blank(env), self.replay_capacity) if q else None,
+            ledger=Ledger.empty(q),
+            allocation=even(self.workers, max(q, 1)),
+            champion=frozen(moments, tree.take(population, 0)),
+            score=jnp.float32(-jnp.inf),  # never tested
+            frames=jnp.int32(0),
+            episodes=jnp.int32(0),
+            generation=jnp.int32(0),
+            moments=moments,
+            seen=moments,
+        )
+
+    def warm(self, state: HybridState, policy: AbstractPolicy) -> HybridState:
+        """`state` that goes on from a saved policy: it becomes the first member and the actor of
+        every learner, and all see observations by its statistics."""
+        policy, moments = warmed(policy, state.moments)
+        pairs = zip(self.learners, state.learners, strict=True)
+        return replace(
+            state,
+            population=tree.put(state.population, 0, policy),
+            learners=tuple(learner.warm(own, policy) for learner, own in pairs),
+            champion=frozen(moments, policy),
+            moments=moments,
+            seen=moments,
+        )
+
+
+def play(
+    hybrid: Hybrid, state: HybridState, policies: PyTree, episodes: int, **how: Any
+) -> tuple[HybridState, Evaluation]:
+    """Play, and store every transition in the replay buffer. `how`: arguments of `collect`.
+
+    All of a generation act by the moments of those before; learners learn by those with what was
+    `seen` since.
+    """
+    policies = behind(state.moments, policies)
+    played, experience = collect(hybrid.env, policies, episodes, **how)
+    state = replace(state, seen=watched(state.seen, experience))
+    if state.replay is not None:
+        new = experience.spread(played) if hybrid.redistribute else experience
+        state = replace(state, replay=extend(state.replay, new.transitions, new.valid))
+    return state, played
+
+
+def breed(
+    hybrid: Hybrid, state: HybridState, fitness: Float[Array, " pop"], *, key: PRNGKeyArray
+) -> tuple[HybridState, Metrics]:
+    """The next population with its lineage, and the champion of this one."""
+    population, lineage, champion, metrics = bred(
+        hybrid, state.population, state.lineage, fitness, key=key
+    )
+    state = replace(state, population=population, lineage=lineage, generation=state.generation + 1)
+    return replace(state, champion=frozen(state.moments, champion)), metrics
+
+
+@jit
+def bred(
+    hybrid: Hybrid, population: PyTree, lineage: Lineage, fitness: Array, *, key: PRNGKeyArray
+) -> tuple[PyTree, Lineage, AbstractPolicy, Metrics]:
+    """`breed` of what it needs, so that the replay buffer is not copied."""
+    fresh = partial(draw, hybrid.network, hybrid.env.sizes)
+    offspring, descent = hybrid.breeder(population, fitness, fresh, key=key)
+    best = ranking(fitness)[0]
+    metrics = lineage.report(best, descent)
+    return offspring, lineage.after(descent), tree.take(population, best), metrics
+
+
+def explore(
+    hybrid: Hybrid, state: HybridState, *, key: PRNGKeyArray
+) -> tuple[HybridState, Int[Array, ""], Metrics]:
+    """Each learner's workers play an episode with noise; the ledger gets their returns.
+
+    **Returns:** the state, the frames played, and which learner played how many episodes.
+    """
+    frames, metrics, workers = jnp.int32(0), {}, hybrid.workers
+    for i, learner in enumerate(hybrid.learners):
+        mine = jnp.sum((state.allocation == i).astype(jnp.int32))
+        team = tree.stack(learner.explorer(state.learners[i], jnp.bool_(False)))
+        how = {"wanted": mine, "common": False, "key": jax.random.fold_in(key, i)}
+        state, played = play(hybrid, state, team, workers, **how)
+        returns, theirs = played.of(hybrid.reward)[0], jnp.arange(workers) < mine
+        ledger = (hybrid.manager or UCB()).observe(state.ledger, i, returns, theirs)
+        state, frames = replace(state, ledger=ledger), frames + jnp.sum(played.steps)
+        metrics |= {f"workers_{i}": mine, f"value_{i}": ledger.value[i]}
+    return state, frames, metrics
+
+
+def improve(
+    hybrid: Hybrid, state: HybridState, frames: Int[Array, ""], *, key: PRNGKeyArray
+) -> tuple[HybridState, Metrics]:
+    """Each learner makes `updates_per_frame` updates for each of the generation's `frames`, on
+    minibatches of its own from the common buffer. The state counts the generation's frames."""
+    ready = (state.frames >= hybrid.warmup_frames) & bool(hybrid.learners)
+    updates = jnp.where(ready, frames.astype(jnp.float32) * hybrid.updates_per_frame, 0.0)
+    updates = updates.astype(jnp.int32)
+    learned, metrics = [], {"updates": updates}
+    for i, learner in enumerate(hybrid.learners):
+        given = {"signal": hybrid.reward, "moments": state.seen, "key": jax.random.fold_in(key, i)}
+        after, report = learn(learner, state.learners[i], state.replay, updates, **given)
+        learned.append(after)
+        metrics |= {f"{name}_{i}": value for name, value in report.items()}
+    state = replace(state, learners=tuple(learned), moments=state.seen)
+    counted = {"frames": state.frames + frames, "episodes": state.episodes + hybrid.rounds}
+    return replace(state, **counted), metrics
+
+
+def inject(hybrid: Hybrid, state: HybridState, due: Bool[Array, ""]) -> HybridState:
+    """If `due`, the learners' actors take the last slots: the offspring of the weakest parents."""
+    pairs = zip(hybrid.learners, state.learners, strict=True)
+    actors = [learner.actor(own) for learner, own in pairs]
+    population, lineage = _injected(state.population, state.lineage, actors, due)
+    return replace(state, population=population, lineage=lineage)
+
+
+@jit
+def _injected(population: PyTree, lineage: Lineage, actors: list[PyTree], due: Bool[Array, ""]):
+    before = population, lineage
+    for i, actor in enumerate(actors):
+        slot = tree.size(population) - 1 - i
+        population, lineage = tree.put(population, slot, actor), lineage.inject(slot, i)
+    return tree.where(due, (population, lineage), before)
+
+
+def tested(
+    hybrid: Hybrid, state: HybridState, fitness: Array, metrics: Metrics, *, key: PRNGKeyArray
+) -> tuple[HybridState, Metrics]:
+    """The champion on fresh episodes, every `test_every` generations. **Returns:** the state with
+    the score of the last test, and all metrics of the generation."""
+    score = when(
+        (state.generation - 1) % hybrid.test_every == 0,
+        lambda: rollout.score(hybrid.env, state.champion, hybrid.test_episodes, key=key),
+        lambda: state.score,
+    )
+    metrics = {
+        "fitness_max": jnp.max(rankable(fitness)),
+        "fitness_mean": jnp.nanmean(fitness),
+        "fitness_nan": jnp.sum(jnp.isnan(fitness)),
+        "champion_score": score,
+        "episodes": state.episodes,
+    } | metrics
+    return replace(state, score=score), metrics

@@ -1,0 +1,66 @@
+"""The command line: one module a command, and the only place where names are looked up.
+
+Nothing here imports JAX before a command needs it: `credo --help` answers at once.
+"""
+
+import importlib
+import os
+import sys
+import warnings
+
+from ..runs import ending
+from .names import ALGORITHMS, COMMANDS, fail
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Entry point of `credo`. Whatever happens ends in a line and an exit code (see `ending`)."""
+    ending.open_streams()
+    words = [*(sys.argv[1:] if argv is None else argv)]  # `list` is a module here
+    ending.run(lambda: _command(words), alone=argv is None)
+
+
+def _command(argv: list[str]) -> None:
+    match argv:
+        case [] | ["-h" | "--help" | "--help-all" | "help", *_]:
+            print(overview())
+        case ["-V" | "--version", *_]:
+            from importlib.metadata import version
+
+            print("credo", version("credo"))
+        case ["--print-completion" | "--complete" as what, *rest]:
+            from . import completion
+
+            print(
+                completion.script(*rest) if what == "--print-completion" else completion.next(rest)
+            )
+        case [command, *rest]:
+            _run(command, rest)
+
+
+def _run(command: str, argv: list[str]) -> None:
+    if command not in COMMANDS:
+        if command in ALGORITHMS:
+            fail(f"{command} is an algorithm: credo train {command} TASK")
+        fail(f"no command {command!r}", command, COMMANDS)
+    from .line import Line
+
+    warnings.showwarning = lambda message, *_args, **_kw: ending.say(f"warning: {message}")
+    sys.path.insert(0, _here())  # environments of users lie where they work
+    importlib.import_module(f".{command}", __name__).run(Line(command, argv))
+
+
+def _here() -> str:
+    try:
+        return os.getcwd()
+    except OSError as error:
+        ending.say(f"credo: this folder is not there any more ({error.strerror}): go to another")
+        raise SystemExit(1) from None
+
+
+def overview() -> str:
+    """Every command in a line."""
+    width = max(map(len, COMMANDS)) + 2
+    lines = ["usage: credo COMMAND …", "", "credit assignment by evolution and gradient", ""]
+    lines += [f"  {name:<{width}}{text}" for name, text in COMMANDS.items()]
+    lines += ["", "credo COMMAND --help shows a command's flags with units and defaults."]
+    return "\n".join(lines)

@@ -1,0 +1,66 @@
+"""Families: what can stand in a field that holds an object, such as a manager or a critic."""
+
+import dataclasses
+import itertools
+import types
+from typing import Any, NamedTuple
+
+from .names import CATALOGUE, fail, load, of_user
+from .values import leaves
+
+
+class Family(NamedTuple):
+    """The known members of a type, by word."""
+
+    makers: dict[str, str]  # where the class or function is that makes one
+    bases: tuple[type, ...]
+    many: bool  # the field is a tuple of them
+    empty: bool  # the field may hold none
+
+    @property
+    def words(self) -> list[str]:
+        """What can be typed."""
+        return [*self.makers, *["none"] * (self.empty and "none" not in self.makers)]
+
+    def word(self, value: Any) -> str:
+        """The word for what stands there."""
+        if isinstance(value, tuple):
+            return ",".join(map(self.word, value)) or "none"
+        words = {path: word for word, path in self.makers.items()}
+        return "none" if value is None else words.get(_path(type(value)), type(value).__name__)
+
+    def chosen(self, flag: str, words: list[str], old: Any) -> Any:
+        """What the words name; what is there already stays as it is."""
+        words = [] if words in (["none"], ["None"]) and "none" not in self.makers else words
+        there = old if self.many else (old,)
+        pairs = itertools.zip_longest(words, there[: len(words)])
+        made = tuple(self._one(flag, word, before) for word, before in pairs)
+        return made if self.many else (*made, None)[0]
+
+    def _one(self, flag: str, word: str, old: Any) -> Any:
+        if ":" in word:  # named on this command line, so it may be imported
+            maker = of_user(word)
+            if not (isinstance(maker, type) and issubclass(maker, self.bases)):
+                fail(f"{word} is no {' or '.join(base.__name__ for base in self.bases)}")
+        elif word not in self.makers:
+            fail(f"no {flag} {word!r}", word, self.words)
+        else:
+            maker = load(self.makers[word])
+        return old if maker is type(old) else of_user(word, maker)
+
+
+def family_of(kind: Any) -> Family | None:
+    """The family of a field's type; None where there is nothing to choose."""
+    kinds = list(leaves(kind))
+    bases = tuple(k for k in kinds if isinstance(k, type) and dataclasses.is_dataclass(k))
+    makers: dict[str, str] = {}
+    for base in bases:
+        own = {base.__name__.lower(): _path(base)}
+        abstract = base.__name__.startswith("Abstract")
+        makers |= CATALOGUE["families"].get(base.__name__, {} if abstract else own)
+    family = Family(makers, bases, tuple in kinds, tuple in kinds or types.NoneType in kinds)
+    return family if makers and len(family.words) > 1 else None
+
+
+def _path(cls: type) -> str:
+    return f"{cls.__module__.removeprefix('credo.')}:{cls.__name__}"

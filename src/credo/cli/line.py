@@ -1,0 +1,182 @@
+"""The arguments of a command, and the objects that are made with them.
+
+Every field of an object, and of the objects inside it, is a flag: `--learners.0.gamma 0.9`. A field
+that holds one of a family takes its word (`--manager ucb`), and has the flags of what was chosen.
+Short names (`--gamma`) stand for all fields that mean the same. Nothing here imports JAX.
+"""
+
+import dataclasses
+import fnmatch
+import re
+import textwrap
+import typing
+from collections.abc import Iterable, Iterator
+from typing import Any, Literal, NamedTuple
+
+from .. import fields
+from .families import family_of
+from .names import CATALOGUE, fail
+from .values import leaves, plain, read, split, typed
+
+TOKEN = re.compile(r"--([^\W\d][^=]*)(?:=(.*))?", re.DOTALL)
+LETTERS = {"-h": "--help", "-o": "--output"}
+OPEN = re.compile(r"((env|options|breeder)\.)+")  # fields of these need no prefix
+CHOSEN = ("env", "network", "options")  # by words and flags of the command
+
+
+class Flag(NamedTuple):
+    """A field that can be typed."""
+
+    name: str  # without dashes
+    path: str  # where it is, "" of a short name
+    kind: Any
+    value: Any
+    text: str
+
+    def help(self, text: str) -> str:
+        """Some lines about it: what it is, what can be typed, and what holds if nothing is."""
+        choices = typing.get_args(self.kind) if typing.get_origin(self.kind) is Literal else ()
+        value = ",".join(map(str, self.value)) if isinstance(self.value, tuple) else self.value
+        told = f"{text} ({', '.join(map(str, choices))})" if choices else text
+        lines = textwrap.wrap(told if value in ("", {}) else f"{told} [{value}]", 72)
+        return f"  --{self.name:<22} " + f"\n{' ' * 27}".join(lines)
+
+
+class Line:
+    """Words, then flags with their values."""
+
+    def __init__(self, command: str, argv: Iterable[str]):
+        self.prog, self.text, self.words, self.help = f"credo {command}", "", [], ""
+        self.given: list[tuple[str, list[str]]] = []
+        self.filed: list[tuple[str, list[str]]] = []  # of a file, as if they were typed before
+        self.flags: dict[str, Flag] = {}  # by path: all that can be typed
+        self.used, self.skipped, self.reserved = set(), set(), set()
+        values = self.words
+        for token in argv:
+            match = TOKEN.fullmatch(LETTERS.get(token, token))
+            if match and match[1] in ("help", "help-all"):
+                self.help = match[1]
+            elif match:
+                values = [] if match[2] is None else [plain(match[2])]
+                self.given.append((match[1].replace("_", "-"), values))
+            else:
+                values.append(plain(token))
+
+    def command(self, cls: type) -> Any:
+        """The command: fields that are not keyword-only are words, the others flags."""
+        words = [f for f in dataclasses.fields(cls) if not f.kw_only]
+        needed = sum(f.default is dataclasses.MISSING for f in words)
+        names = [f"[{f.name.upper()}]" if f.default is None else f.name.upper() for f in words]
+        self.prog = " ".join((self.prog, *self.words, *names[len(self.words) :]))
+        self.text = " ".join((cls.__doc__ or "").split())
+        self.skipped = {f.name for f in words}
+        try:
+            command = self.take(cls(*[None] * needed))
+        except ValueError as error:  # it begins with the name of an option
+            fail(re.sub(r"^\w+", lambda m: "--" + m[0].replace("_", "-"), str(error)))
+        self.skipped = set()
+        if len(self.words) < needed:
+            self.end()
+        many = bool(words) and tuple in leaves(typing.get_type_hints(cls)[words[-1].name])
+        if len(self.words) > len(words) and not many:
+            most = "one word" if len(words) == 1 else f"{len(words)} words"
+            fail(f"{self.prog} takes {most}, and {self.words[len(words)]!r} is another")
+        placed = {f.name: word for f, word in zip(words, self.words, strict=False)}
+        placed |= {words[-1].name: tuple(self.words[len(words) - 1 :])} if many else {}
+        return dataclasses.replace(command, **placed)
+
+    def take(self, value: Any, path: str = "") -> Any:
+        """`value` with what the flags say of its fields, and of the objects inside it. Raises what
+        they raise about the values."""
+        kinds, texts, new = _kinds(type(value)), fields.texts(type(value)), {}
+        if not path:
+            self.reserved |= {f.name.replace("_", "-") for f in dataclasses.fields(value)}
+        for f in dataclasses.fields(value):
+            if not f.init or f.name in self.skipped:
+                continue
+            at, here, kind = path + f.name, getattr(value, f.name), kinds.get(f.name, Any)
+            family = None if f.name in CHOSEN else family_of(kind)
+            if family:
+                kind = Literal[(*family.words,)]  # pyright: ignore[reportInvalidTypeForm]
+                for words in self._given(at, kind, family.word(here), texts):
+                    here = family.chosen(f.name, split(words), here)
+            elif typed(kind):
+                for words in self._given(at, kind, here, texts):
+                    here = read(self.flags[at].name, kind, words, here, self.words)
+            new[f.name] = self._inside(here, at)
+        new = {name: x for name, x in new.items() if x is not getattr(value, name)}
+        return dataclasses.replace(value, **new) if new else value
+
+    def _inside(self, value: Any, at: str) -> Any:
+        if isinstance(value, tuple) and any(map(dataclasses.is_dataclass, value)):
+            made = tuple(self.take(one, f"{at}.{i}.") for i, one in enumerate(value))
+            return made if any(a is not b for a, b in zip(made, value, strict=True)) else value
+        return self.take(value, f"{at}.") if dataclasses.is_dataclass(value) else value
+
+    def _given(self, at: str, kind: Any, value: Any, texts: dict[str, str]) -> Iterator[list[str]]:
+        """The values that were typed for a field: of a file first, short names before full ones."""
+        full = at.rstrip("_").replace("_", "-")
+        name, task = OPEN.sub("", full), at.startswith("env.")
+        name = full if task and name in self.reserved else name
+        self.reserved |= set() if task else {name}
+        self.flags[at] = Flag(name, at, kind, value, texts.get(at.rpartition(".")[2], ""))
+        for given in (self.filed, self.given):
+            for names in (shorts(at), {name, full}):
+                for other, values in given:
+                    key = other.removeprefix(f"{name}.")
+                    if other in names or (key != other and dict in leaves(kind)):
+                        self.used.add(other)
+                        yield values if other in names else [key, *values]
+
+    def known(self) -> dict[str, Flag]:
+        """All flags by name; a short name stands for several."""
+        found: dict[str, Flag] = {}
+        for flag in self.flags.values():
+            for name in shorts(flag.path) - found.keys():
+                text = CATALOGUE["short"][name][0]
+                found[name] = flag._replace(name=name, path="", text=text)
+        return found | {flag.name: flag for flag in self.flags.values()}
+
+    def done(self) -> None:
+        """All flags are known: show them if that was asked, and complain of any other."""
+        if self.help:
+            self.end()
+        known = self.known()
+        for name in [name for name, _ in self.filed + self.given if name not in self.used]:
+            meant = CATALOGUE["meant"].get(name, "")
+            if meant in known or " " in meant:
+                fail(f"no flag '--{name}': {meant if ' ' in meant else f'it is called --{meant}'}")
+            more = {f"--{other}" for other in known}
+            fail(f"no flag '--{name}': see {self.prog} --help-all", f"--{name}", more=more)
+
+    def end(self) -> typing.NoReturn:
+        """End with help: the flags that people use, or with --help-all every field."""
+        print(f"usage: {self.prog} [flags]\n\n{textwrap.fill(self.text, 98)}\n")
+        known = self.known()
+        if self.help == "help-all" or len(known) < 20:
+            groups = {name: flag.path.rpartition(".")[0] for name, flag in known.items()}
+            for title in dict.fromkeys(groups.values()):
+                if title not in ("", "options"):
+                    print(f"\n{title}")
+                print(
+                    *[f.help(f.text) for f in known.values() if groups[f.name] == title], sep="\n"
+                )
+        else:
+            for flag in [known[name] for name in CATALOGUE["screen"]["first"] if name in known]:
+                print(flag.help(re.split(r"(?<=[\w`)\]])[.:;] ", flag.text)[0]))
+            print(f"\n--help-all lists every field: {len(known)} flags.")
+        raise SystemExit(0 if self.help else 2)
+
+
+def shorts(path: str) -> set[str]:
+    """The short names that stand for a field."""
+    table = CATALOGUE["short"].items()
+    return {name for name, (_, *paths) in table if any(fnmatch.fnmatch(path, p) for p in paths)}
+
+
+def _kinds(cls: type) -> dict[str, Any]:
+    """The annotations of a class; of one whose annotations cannot be read, none."""
+    try:
+        return typing.get_type_hints(cls)
+    except Exception:  # a name that its module knows for type checkers alone
+        return {}

@@ -1,0 +1,62 @@
+"""All settings of a training as TOML, a line a flag: `credo train --config run.toml`."""
+
+import json
+import pathlib
+import re
+import tomllib
+from typing import Any
+
+from ..environments.names import OWN_TEAMS
+from .line import Line
+from .names import fail
+
+OWN = ("config", "save_config", "print_config", "trust")  # about the file itself
+
+
+def read(path: str, *, trust: bool) -> list[tuple[str, list[str]]]:
+    """Flags as if they were typed. Tables may be nested: `[learner]`, `gamma = 0.9`. Whoever wrote
+    the file is not who typed its name: without `trust`, what names code of others is refused."""
+    try:
+        found = list(_flat(tomllib.loads(pathlib.Path(path).read_text("utf-8")), ""))
+    except (OSError, ValueError) as error:
+        fail(f"--config {path}: {error}")
+    for name, values in found:
+        if name.replace("-", "_") in OWN:
+            fail(f"{path} sets --{name}, which is for the command line alone")
+        for value in values if not trust else ():
+            team = name == "task" and "." in value and not value.startswith(OWN_TEAMS)
+            if team or re.search(r"\w:\w", value):
+                fail(
+                    f"{path} names {value!r}, maybe code of others: look into it, and give --trust"
+                )
+    return found
+
+
+def _flat(table: dict[str, Any], prefix: str):
+    for key, value in table.items():
+        name = f"{prefix}{key}".replace("_", "-")
+        if isinstance(value, dict):
+            yield from _flat(value, f"{name}.")
+        else:
+            yield name, [str(x) for x in (value if isinstance(value, list) else [value])]
+
+
+def written(command: Any, algorithm: Any) -> str:
+    """The settings of a command and of its algorithm, for `read`."""
+    told = {"algorithm": command.algorithm, "task": command.task}
+    for value, empty in ((command, (None, {}, ())), (algorithm, ())):
+        line = Line("train", [])
+        line.skipped = {"algorithm", "task", "id", *OWN}
+        line.take(value)
+        told |= {flag.name: flag.value for flag in line.flags.values() if flag.value not in empty}
+    return "".join(f"{json.dumps(name)} = {_toml(value)}\n" for name, value in told.items())
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        value = [f"{name}={x!r}" for name, x in value.items()]
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value) if isinstance(value, int | float) else json.dumps(str(value))

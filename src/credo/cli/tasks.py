@@ -1,0 +1,129 @@
+"""Tasks by name: Credo's own, a class or function of one's own, and those of other packages."""
+
+import dataclasses
+import importlib
+import importlib.util
+import re
+import sys
+import traceback
+from typing import Any
+
+from ..environments import checks, names
+from ..environments.base import AbstractEnvironment
+from ..environments.gymnasium import Gymnasium
+from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
+from ..environments.pettingzoo import PettingZoo
+from ..runs.ending import first, say
+from .names import CATALOGUE, TASKS, fail, load, of_user
+from .values import pairs
+
+KINDS = {"gymnasium": Gymnasium, "pettingzoo": PettingZoo}
+
+
+def task(name: str, kwargs: dict[str, Any], rewards: tuple[str, ...]) -> Any:
+    """A task with its defaults, made with `kwargs`; `rewards` as in `with_settings`."""
+    return with_settings(_named(name, kwargs), kwargs, rewards)
+
+
+def with_settings(env: Any, kwargs: dict[str, Any], rewards: tuple[str, ...] = ()) -> Any:
+    """A task that is made with other `kwargs`, those that are not named stay; with other `rewards`:
+    names of a task's own ones, or NAME=MODULE:FUNCTION for a team of PettingZoo."""
+    if not (kwargs or rewards):
+        return env
+    known, new = {f.name for f in dataclasses.fields(env)}, {}
+    if "env" in known and "kwargs" not in known:  # a wrapper
+        return dataclasses.replace(env, env=with_settings(env.env, kwargs, rewards))
+    for name in {name for name, x in (("kwargs", kwargs), ("rewards", rewards)) if x} - known:
+        fail(f"{type(env).__name__} has no --{name}: its settings are flags, see --help-all")
+    if kwargs:
+        new["kwargs"] = dict(env.kwargs) | kwargs
+    if rewards:
+        own = isinstance(env, PettingZoo)
+        new["rewards"] = dict(env.rewards) | pairs("rewards", [*rewards]) if own else rewards
+    return dataclasses.replace(env, **new)
+
+
+def _named(name: str, kwargs: dict[str, Any]) -> Any:
+    if name in TASKS:
+        return load(TASKS[name]["path"])()
+    if re.fullmatch(r"\w+(\.\w+)*:\w+", name):
+        return _own(name, kwargs)
+    if re.fullmatch(r"\w+(\.\w+)+", name):  # a module with parallel_env
+        return PettingZoo(id=_team(name))
+    if match := re.fullmatch(r"(?:\./)?(\w+)\.py:(\w+)", name):  # a file in place of its module
+        fail(f"{name!r} names a file: name its module, {match[1]}:{match[2]}")
+    import gymnasium
+
+    module, _, id = name.rpartition(":")
+    if module:  # package:Name-v0, registered when it is imported
+        of_user(name, lambda: importlib.import_module(module))
+    if id not in gymnasium.registry:
+        _absent(name, id, gymnasium.registry)
+    return Gymnasium(id=name)
+
+
+def _absent(name: str, id: str, registry: Any) -> None:
+    """Say what was meant by an id that nobody registered."""
+    if package := CATALOGUE["packages"].get(id.partition("/")[0]):
+        module = package.replace("-", "_")
+        fail(f"{id} is a task of {package}: pip install {package}, then name it {module}:{id}")
+    fail(f"no task {name!r}; one of your own is written package.module:name", name, TASKS, registry)
+
+
+def _team(name: str) -> str:
+    """The module of a team; of what is no module, what was meant."""
+    module, _, cls = name.rpartition(".")
+    try:
+        found = importlib.util.find_spec(name)
+    except ModuleNotFoundError:
+        found = None
+    if found is None:
+        fail(f"no module {name!r}: a class or function of your own is written {module}:{cls}")
+    return name
+
+
+def _own(name: str, kwargs: dict[str, Any]) -> Any:
+    """A class of one's own, or a plain function that makes an environment: it may be called, since
+    it is named on this command line."""
+    found = of_user(name)
+    module, _, missing = name.partition(":")
+    if found is None:
+        why = f"{module} has no {missing}"
+        fail(f"cannot import {name!r}: {why}. Start credo in the folder of its file")
+    if isinstance(found, type) and issubclass(found, AbstractEnvironment | AbstractHostEnvironment):
+        return of_user(name, found)
+    kind = of_user(name, lambda: names.kind_of(name, kwargs))
+    if kind is None:
+        fail(
+            f"{name} is no task: derive it from credo.AbstractEnvironment or gymnasium.Env, or "
+            "name a function that makes a gymnasium.Env or a pettingzoo.ParallelEnv"
+        )
+    return KINDS[kind](id=name)
+
+
+def require_sound(name: str, env: Any) -> None:
+    """End with what is wrong with a task that is not ours, before anything is trained on it."""
+    if ":" in name:
+        if found := problems(env):
+            say("\n".join(f"- {problem}" for problem in found))
+            fail(f"fix {name} before training: `credo check {name}` checks it again")
+    elif name not in TASKS:
+        try:
+            env.copies(1)
+        except EnvironmentFailure as failure:
+            fail(f"cannot make the task {name!r}: {failure}")
+
+
+def problems(env: Any) -> list[str]:
+    """What `check_environment` finds; an exception of the task's own code is a problem too."""
+    try:
+        return checks.check_environment(env)
+    except Exception as error:  # the task is somebody else's code: say where, and what often helps
+        own = sys.modules[type(env).__module__].__file__
+        frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == own]
+        where = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+        return [
+            f"it raised {type(error).__name__}{where}: {first(error)} (everything runs inside JAX: "
+            "choose with jnp.where, not `if`; methods are sample(self, *, key) and reward(self, "
+            "answer, target, scored, perfect))"
+        ]

@@ -1,0 +1,195 @@
+"""Measurements that several experiments share: rows and series of the runs of a cell.
+
+Each function makes a measurement, to be named in `Experiment.measures`: `final(episodes=10)` plays
+the final champions, `scores()` reads what their runs logged. The champion is the best policy of a
+run, as it was tested.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from .. import tree
+from ..algorithms.lineage import MAKERS
+from ..analysis import attribution, planner, statistics
+from ..environments.gymnasium import close_all
+from ..environments.rover import Rover
+from ..environments.wrappers import DelayedHostReward
+from ..networks.exploration import Explorer, GaussianNoise
+from ..networks.mlp import MLP
+from ..report.rows import Row, Series, rows, series
+from ..report.run_page import learner_names
+from ..rollout import evaluate
+from ..runs.loop import Run
+from .base import Measure, Trained
+
+FINAL_KEY, BASELINE_KEY = 20_000, 21_000  # runs have seeds below 10,000
+SMOOTHED = 10  # generations; the author's undisclosed moving average
+
+
+def undelayed(env: Any) -> Any:
+    """The task whose returns are those of `env`: a delay changes only when rewards are paid."""
+    return env.env if isinstance(env, DelayedHostReward) else env
+
+
+# --------------------------------------------------------------------------- the final champions
+
+
+def returns(env: Any, policies: PyTree, episodes: int, key: int) -> np.ndarray:
+    """What the task reports of `[policies, episodes]`, without noise, in the same worlds."""
+    played = evaluate(env, policies, episodes, key=jax.random.key(key)).of(env.reported)
+    close_all()  # simulators of dozens of episodes
+    return np.asarray(played)
+
+
+def final(
+    metric: str = "return", episodes: int = 10, digits: int = 2, each: bool = True
+) -> Measure:
+    """The final champions on fresh episodes that they share: a row for `each` episode, or the
+    mean over all."""
+
+    def measure(cell: Trained) -> list[Row]:
+        played = returns(cell.env, cell.champions, episodes, FINAL_KEY)
+        axes = {"seed": cell.seeds} | ({"episode": None} if each else {})
+        values = played if each else np.mean(played, axis=1)
+        return rows(metric, attribution.plain(values, digits), cell.labels, **axes)
+
+    return measure
+
+
+# --------------------------------------------------------------------------- what their runs logged
+
+
+def over(run: Run, axis: str) -> np.ndarray:
+    """`frames` (environment steps) or `episodes` at the end of every generation, so far."""
+    metrics = run.metrics
+    if axis == "episodes" and axis not in metrics:
+        return metrics["generation"] * run.algorithm.episodes
+    return metrics[axis]
+
+
+def scores(x: str = "frames", points: int = 100, digits: int = 2) -> Measure:
+    """Series "test score" of the champions' tests, on a grid over `x` that all runs share: each
+    point has the last test that was over by then."""
+
+    def measure(cell: Trained) -> list[Series]:
+        xs = [over(run, x) for run in cell.runs]
+        grid = attribution.axis(xs, points)
+        tested = [run.metrics["champion_score"] for run in cell.runs]
+        values = [attribution.on_grid(at, y, grid) for at, y in zip(xs, tested, strict=True)]
+        found = attribution.plain(values, digits)
+        return series("test score", x, grid.astype(int), found, cell.labels, seed=cell.seeds)
+
+    return measure
+
+
+def last_tests(cell: Trained) -> list[Row]:
+    """The last test of each run, as logged and smoothed over generations."""
+    tested = [run.metrics["champion_score"] for run in cell.runs]
+    found = {
+        "last test": tested,
+        "last test, smoothed": [statistics.moving_average(x, SMOOTHED) for x in tested],
+    }
+    return [
+        row
+        for metric, values in found.items()
+        for row in _per_run(cell, metric, attribution.plain([x[-1] for x in values], 2))
+    ]
+
+
+def effort(cell: Trained) -> list[Row]:
+    """Frames that each run took, and gradient updates for each of them."""
+    metrics = [run.metrics for run in cell.runs]
+    updates = [m["updates"].sum() / m["frames"][-1] if "updates" in m else np.nan for m in metrics]
+    return [
+        *_per_run(cell, "frames", [int(m["frames"][-1]) for m in metrics]),
+        *_per_run(cell, "updates per frame", attribution.plain(updates, 3)),
+    ]
+
+
+def first(metric: str, level: float, x: str) -> Measure:
+    """Where on `x` a test first reached `level`; null for runs in which none did."""
+
+    def measure(cell: Trained) -> list[Row]:
+        found = []
+        for run in cell.runs:
+            reached = np.flatnonzero(run.metrics["champion_score"] >= level)
+            found.append(int(over(run, x)[reached[0]]) if reached.size else None)
+        return _per_run(cell, metric, found)
+
+    return measure
+
+
+def _per_run(cell: Trained, metric: str, values: Any) -> list[Row]:
+    return rows(metric, values, cell.labels, seed=cell.seeds)
+
+
+def lineage(cell: Trained) -> list[Row | Series]:
+    """Who made the champions of hybrids: which operator changed them last, which learner their
+    weights come from, and how workers were allocated."""
+    found = attribution.summary([run.metrics for run in cell.runs])
+    names = learner_names(cell.cell.algorithm.learners)
+    curves = {
+        "last changed by": ("makers", {"operator": MAKERS}),
+        "ancestry": ("ancestry", {"ancestor": [*names, "first draw"]}),
+        "allocation so far": ("allocation", {"learner": names}),
+    }
+    shares = {
+        "allocation": ("allocated", {"learner": names}),
+        "injected": ("injected", {"learner": names}),
+        "fate": ("fates", {"learner": names, "fate": attribution.FATES}),
+    }
+    made: list[Row | Series] = []
+    for metric, (key, axes) in curves.items():
+        told = {"seed": cell.seeds} | axes
+        made += series(metric, "frames", found["frames"], found[key], cell.labels, **told)
+    for metric, (key, axes) in shares.items():
+        made += rows(metric, found[key], cell.labels, seed=cell.seeds, **axes)
+    return made
+
+
+def of_portfolio(cell: Trained) -> list[Row | Series]:
+    """The same, of cells with more than one learner."""
+    learners = getattr(cell.cell.algorithm, "learners", ())
+    return lineage(cell) if len(learners) > 1 else []
+
+
+# ------------------------------------------------------------------------------------- baselines
+
+
+def of_task(numbers: Callable[[Any], dict[str, float]]) -> Measure:
+    """Numbers of a cell's task, without a seed: baselines, bounds."""
+
+    def measure(cell: Trained) -> list[Row]:
+        found = numbers(undelayed(cell.env))
+        return [row for metric, x in found.items() for row in rows(metric, x, cell.labels)]
+
+    return measure
+
+
+@functools.cache
+def random_actions(env: Any, episodes: int = 100) -> dict[str, float]:
+    """Mean return of actions drawn uniformly from [-1, 1], and its standard error."""
+    actor = MLP(hidden=()).init(env.obs_size, env.action_size, key=jax.random.key(0))
+    policy = Explorer(actor, GaussianNoise(), jnp.bool_(True), env.action_size)
+    played = returns(env, tree.stack(policy), episodes, BASELINE_KEY)[0].astype(np.float64)
+    mean, error = statistics.mean_and_standard_error(played)
+    return {"random": round(float(mean), 2), "random, s.e.": round(float(error), 2)}
+
+
+def rover_baselines(env: Rover) -> dict[str, float]:
+    """Mean shares of POIs in 50 worlds: of teams that act by their sensors alone (random, straight,
+    greedy), of a planner that knows every position (scripted), and a proven upper bound (bound)."""
+    return _rover_baselines(dataclasses.replace(env, rewards=("global",)))
+
+
+@functools.cache
+def _rover_baselines(env: Rover) -> dict[str, float]:
+    found = planner.floors_and_ceilings(env, 50, key=jax.random.key(BASELINE_KEY))
+    return {name: round(float(np.mean([row[name] for row in found])), 3) for name in found[0]}

@@ -1,0 +1,45 @@
+"""What people call a run: the command line's word for its algorithm, and its task's name.
+
+Both are read from the object tree that a run records (`config.to_tree`), so that folders and the
+legends of pages say the same, whoever started the run. Nothing here imports JAX.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def run_name(algorithm: Mapping[str, Any]) -> str:
+    """`erl-Hopper-v5` or `cerl-Swimmer-v5-delayed`, for the object tree of an algorithm."""
+    return f"{algorithm_word(algorithm)}-{task_word(algorithm['env'])}"
+
+
+def algorithm_word(algorithm: Mapping[str, Any]) -> str:
+    """The word that `credo train` has for an algorithm: `td3`, `erl`, `cerl`, `ea`, …; of a class
+    of your own its name in lower case."""
+    name = _class(algorithm)
+    if name == "ERL":
+        learners = len(algorithm["learners"])
+        return "cerl" if algorithm["manager"] or learners > 1 else ("erl" if learners else "ea")
+    return _learner_word(algorithm["learner"]) if name == "OffPolicy" else name.lower()
+
+
+def task_word(env: Mapping[str, Any]) -> str:
+    """A task's id in Gymnasium or PettingZoo without its package, or the name of its class; with
+    `-delayed` where its reward comes at the end of an episode."""
+    delayed = ""
+    while "env" in env:  # a wrapper
+        delayed = "-delayed" if _class(env).startswith("Delayed") else delayed
+        env = env["env"]
+    return str(env.get("id") or _class(env)).rpartition(":")[2] + delayed
+
+
+def _learner_word(learner: Mapping[str, Any]) -> str:
+    name = _class(learner)
+    if name != "TD3":
+        return name.lower()
+    team = "ma" if _class(learner["critic"]) == "JointCritic" else ""
+    return team + ("td3" if learner["critics"] > 1 else "ddpg")
+
+
+def _class(tree: Mapping[str, Any]) -> str:
+    return str(tree["class"]).rpartition(":")[2]
