@@ -15,7 +15,6 @@ GROUPS = {
     "rollout": ("Playing episodes", "How a policy meets a task, and the records of that."),
 }
 MORE = [  # documented beside the names that `credo` exports, where they exist
-    "credo.evolution.breeder.Breeder",
     "credo.rollout.collect",
     "credo.rollout.record",
     "credo.rollout.Experience",
