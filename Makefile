@@ -25,7 +25,7 @@ test: $(VENV)/installed
 	$(BIN)/python -m pytest --numprocesses $(WORKERS)
 
 docs: $(VENV)/installed
-	$(BIN)/python -m sphinx -W --keep-going -b html docs build/docs
+	$(BIN)/python -m sphinx -E -W --keep-going -b html docs build/docs
 	@echo "build/docs/index.html"
 
 lint: $(VENV)/installed

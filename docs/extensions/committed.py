@@ -28,17 +28,12 @@ def row(name: str, title: str, path: pathlib.Path) -> str:
     """What one `results.json` holds."""
     record = json.loads(path.read_text("utf-8"))
     cells = record["cells"]
-    seeds = sorted({count(cell) for cell in (cells.values() if type(cells) is dict else cells)})
+    seeds = sorted({len(cell["seeds"]) for cell in cells})
     runs = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
     whole = any("--only" not in command for command in record["command"].split("&&"))
     part = str(len(cells)) if whole else f"{len(cells)}, a part"
     link = f"[data](../../{path.relative_to(ROOT).as_posix()})"
     return f"| {name} | {title} | {path.parent.name} | {part} | {runs} | {link} |"
-
-
-def count(cell: dict) -> int:
-    """Runs of a cell."""
-    return len(cell["seeds"]) if "seeds" in cell else cell["runs"]
 
 
 def parts() -> tuple[str, str, str]:

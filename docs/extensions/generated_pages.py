@@ -15,7 +15,6 @@ GROUPS = {
     "rollout": ("Playing episodes", "How a policy meets a task, and the records of that."),
 }
 MORE = [  # documented beside the names that `credo` exports, where they exist
-    "credo.evolution.breeder.Breeder",
     "credo.rollout.collect",
     "credo.rollout.record",
     "credo.rollout.Experience",
@@ -30,6 +29,7 @@ HOMES = {"types": "rollout", "runner": "runs", "report": "runs"}  # modules with
 
 def setup(app):
     app.connect("builder-inited", generate)
+    app.connect("build-finished", copy_pictures)
     return {"parallel_read_safe": True}
 
 
@@ -42,6 +42,15 @@ def generate(app) -> None:
     write(target / "reference" / "index.md", contents("Python reference", GROUPS))
     pages = copied(pathlib.Path(app.srcdir).parent / "results", target / "results")
     write(target / "results" / "index.md", contents("Experiments, page by page", pages))
+
+
+def copy_pictures(app, error) -> None:
+    """Pages of experiments name their pictures in HTML, where Sphinx does not see them."""
+    source = pathlib.Path(app.srcdir)
+    for picture in (source / "generated" / "results").rglob("*.svg"):
+        target = pathlib.Path(app.outdir) / picture.relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(picture, target)
 
 
 def grouped() -> dict[str, list[tuple[str, object]]]:

@@ -27,6 +27,7 @@ from .environments.wrappers import NoisyObservations as NoisyObservations
 from .environments.wrappers import delayed as delayed
 from .evolution.agents import AgentCrossover as AgentCrossover
 from .evolution.agents import Homogenize as Homogenize
+from .evolution.breeder import Breeder as Breeder
 from .evolution.crossover import AbstractCrossover as AbstractCrossover
 from .evolution.crossover import MaskedCrossover as MaskedCrossover
 from .evolution.crossover import OnePointCrossover as OnePointCrossover

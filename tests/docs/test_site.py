@@ -129,3 +129,9 @@ def test_pages_speak_the_fields_words(page):
         if page.name != "CHANGELOG.md" and re.search(word, text, re.IGNORECASE)
     ]
     assert not found
+
+
+def test_code_names_pages_that_exist():
+    for path in [*(ROOT / "src").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]:
+        for page in re.findall(r"\bdocs/[\w/-]+\.md", path.read_text("utf-8")):
+            assert (ROOT / page).exists(), f"{path.relative_to(ROOT)}: {page}"

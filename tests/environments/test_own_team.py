@@ -1,4 +1,4 @@
-"""The example of a team of one's own keeps what docs/merl.md says of it."""
+"""The example of a team of one's own keeps what docs/tutorials/own-team.md says of it."""
 
 import pathlib
 

@@ -107,8 +107,8 @@ class BPTT(eqx.Module):
 
     @classmethod
     def ours(cls, env: AbstractSequenceTask, network: AbstractNetwork, **overrides) -> Self:
-        """The best settings found for 200 generations, with what was tried in docs/gradient.md: 50
-        updates on batches of 20 in place of one on 1000, no L2, a clipped gradient, a rate that
+        """The best settings found for 200 generations (docs/notes/gradient.md has what was tried):
+        50 updates on batches of 20 in place of one on 1000, no L2, a clipped gradient, a rate that
         falls (for longer runs `decay` nearer to 1). An MMU starts with its write gate closed."""
         if isinstance(network, MMU):
             network = dataclasses.replace(network, start_weights="closed")

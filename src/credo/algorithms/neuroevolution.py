@@ -112,7 +112,7 @@ class Neuroevolution(eqx.Module):
 
     @classmethod
     def ours(cls, env: Environment, network: AbstractNetwork, **overrides) -> Self:
-        """The best settings found, with their ablation in docs/neuroevolution.md: the author's
+        """The best settings found (ablation: docs/algorithms/neuroevolution.md): the author's
         operators with weights clipped to ±40 and a tenth of the hits erasing. On a sequence task
         also a curriculum, the share of right answers as fitness, and parsimony; on Sequence
         Classification the curriculum's signals persist. An MMU starts with saturated gates."""

@@ -74,7 +74,7 @@ def rewards(method: str) -> tuple[str, ...]:
 
 def rovers(method: str, **fields: Any) -> Rover:
     """The rover domain, with the local reward that was best for MERL and for TD3 alone
-    (docs/merl.md says what was tried) unless `fields` have another."""
+    (docs/notes/hybrids.md says what was tried) unless `fields` have another."""
     return Rover(**({"rewards": rewards(method), "local": "progress"} | fields))
 
 

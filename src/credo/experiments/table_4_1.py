@@ -32,7 +32,7 @@ def cells(budget: str) -> list[Cell]:
     """DMMUs of three memory cells on the fleet of the case study.
 
     Mutation is stronger than the printed one (0.9 of the matrices, 10 % noise, no more), which
-    learns much slower: docs/team-memory.md. Ten episodes, as printed, may miss a configuration.
+    learns much slower: docs/notes/team-memory.md. Ten episodes, as printed, may miss one.
     """
     labels = {"task": "case study", "network": "dmmu"}
     task, fields = (ServerFleet.case_study(), DMMU(hidden=3)), {"mutation": MUTATION}

@@ -67,7 +67,7 @@ class MMU(AbstractNetwork):
     """`open`: gates follow what is observed, and memory saturates none of them. Input weights (K)
     are drawn 3.7 times as large, output feedback (R) 0.4 times, weights on memory (N, a
     learned decoder's too) 0.16 times, but N_p 0.6 times, and b_p 2.5 times; b_i and b_w are raised
-    by 2.7 and 1.2, b_r is lowered by 2.3. Found by trial: docs/team-memory.md.
+    by 2.7 and 1.2, b_r is lowered by 2.3. Found by trial: docs/notes/team-memory.md.
     `closed`: the write gate's bias is lowered by 4, so that memory hardly moves before a gate
     has learned to open, and gradients reach back through it (compare an LSTM's forget bias).
     `saturated`: at first every gate is open or shut by the input alone, and memory is read but
