@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
+from credo.algorithms.lineage import MAKERS
 from credo.analysis.attribution import FATES
-from credo.evolution.lineage import MAKERS
 from credo.report.rows import Labels, Results, Row, Series, concat, rows, series
 
 Found = list[Row | Series]

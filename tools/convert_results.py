@@ -14,6 +14,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from importlib import import_module
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import scipy.stats
+from modern_settings import modern
 
 from credo.experiments import base
 from credo.report.rows import Results, write
@@ -53,6 +55,8 @@ def convert(path: Path) -> tuple[Results, dict[str, Any]]:
     """A file in today's format, and its line of the log. Raises `ValueError` if a value is lost."""
     old = json.loads(path.read_text())
     new = converters()[old["experiment"]](old)
+    cells = [cell | {"algorithm": modern(cell["algorithm"])} for cell in new.cells]
+    new = replace(new, cells=cells)
     line = compare(old, new)
     page = path.with_name("report.html")
     return new, line | (pages(page.read_text(), new) if page.exists() else {})

@@ -56,9 +56,9 @@ from jaxtyping import PyTree
 
 from .. import tree
 from ..executors import local
-from ..report.pages import write as write_page
+from ..report import pages
 from ..report.rows import Label, Labels, Results, Row, Series, concat, read, write
-from ..report.sections import Page, Section
+from ..report.sections import SMOKE, Page, Section
 from ..runs import config, log
 from ..runs.options import RunOptions
 from ..runs.record import RunError
@@ -353,9 +353,11 @@ def merged(earlier: Results, results: Results, every: list[Cell]) -> Results:
 
 
 def page(path: pathlib.Path) -> pathlib.Path:
-    """Write `report.html` beside a `results.json`, from its rows alone."""
-    target = path.with_name("report.html")
-    write_page(describe(read(path)), target)
+    """Write `report.html` beside a `results.json`, and `README.md` with its figures as SVG files
+    for a repository page, from rows alone."""
+    described, target = describe(read(path)), path.with_name("report.html")
+    pages.markdown(described, path.parent)
+    pages.write(described, target)
     return target
 
 
@@ -370,12 +372,13 @@ def describe(results: Results) -> Page:
         sections=sections(experiment, results),
         facts={
             "budget": results.budget,
-            "runs": "; ".join(f"{named(c['labels'])}: {extent(c)}" for c in results.cells),
+            "runs": [f"{named(c['labels'])}: {extent(c)}" for c in results.cells],
             "machine": _once(f"{m['processor']}, {m['device']}, {m['system']}" for m in machines),
             "versions": _once(
                 ", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines
             ),
         },
+        banner=SMOKE if results.budget == "smoke" else "",
     )
 
 
@@ -395,5 +398,5 @@ def extent(cell: Mapping[str, Any]) -> str:
     return f"{len(cell['seeds'])} × {' or '.join(words)}"
 
 
-def _once(texts: Iterable[str]) -> str:
-    return "; ".join(dict.fromkeys(texts))
+def _once(texts: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(texts))

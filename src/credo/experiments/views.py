@@ -277,6 +277,7 @@ class Curves:
                 self.caption,
                 self.log_x,
                 self.y_range,
+                joined=bool(here.curves),
             )
 
     def curve(self, results: Results, label: str) -> page.Curve:
