@@ -39,12 +39,8 @@ class Replay(eqx.Module):
         """
         require.at_least("capacity", capacity, 1)
         size = row_bytes(row)
-        if _filled.get() and capacity * size > SMALL and capacity * size > (free := _free()):
-            raise ValueError(
-                f"a replay buffer of {capacity:,} transitions needs {capacity * size:,} bytes, and "
-                f"this process may take {free:,} more: give a smaller capacity, at most "
-                f"{free // size:,}; runs at the same time (--seeds) share them"
-            )
+        if _filled.get() and capacity * size > SMALL:
+            require.memory(capacity, size, _free())
         zeros = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), row)
         return cls(zeros, jnp.int32(0))
 

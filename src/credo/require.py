@@ -36,6 +36,16 @@ def signal(given: str | None, known: tuple[str, ...]) -> None:
         raise ValueError(f"no reward signal {given!r}: this task has {', '.join(known)}")
 
 
+def memory(capacity: int, size: int, free: int) -> None:
+    """Raise if a replay buffer of transitions of `size` bytes needs more than is `free`."""
+    if capacity * size > free:
+        raise ValueError(
+            f"a replay buffer of {capacity:,} transitions needs {capacity * size:,} bytes, and "
+            f"this process may take {free:,} more: give a smaller capacity, at most "
+            f"{free // size:,}; runs at the same time (--seeds) share them"
+        )
+
+
 def fits(env: Any, network: Any, *learners: Any) -> None:
     """A network that acts for as many agents as the task has, and learners that can learn it."""
     team = env.agents is not None

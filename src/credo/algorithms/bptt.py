@@ -17,9 +17,9 @@ Kaiming-normal weights, sequences padded to one length. Departures, and what it 
   gradient version had other inputs on Sequence Recall, no biases, and did not read its memory.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Any, ClassVar, Literal, Self
 
 import equinox as eqx
@@ -41,6 +41,8 @@ LONG = 1000  # steps from which on not every carry is kept
 
 
 class BPTTState(eqx.Module):
+    """What BPTT knows between two generations."""
+
     champion: AbstractPolicy  # the network
     optimizer: optax.OptState
     done: Int[Array, ""]  # updates
@@ -59,20 +61,22 @@ class BPTT(eqx.Module):
 
     env: AbstractSequenceTask
     network: AbstractNetwork = MMU()
-    batch_size: int = eqx.field(static=True, default=1000)  # sequences per update
-    updates: int = eqx.field(static=True, default=1)  # per generation
+    batch_size: int = eqx.field(static=True, default=1000)  # sequences per update, at least 1
+    updates: int = eqx.field(static=True, default=1)  # of Adam per generation, at least 1
     train_size: int | None = eqx.field(static=True, default=None)
-    """Sequences of a training set drawn once; None: fresh ones for every update."""
-    learning_rate: float = 0.01  # of Adam
-    decay: float = 1.0  # of the learning rate, from one update to the next
-    l2: float = 0.1  # times the weights, is added to the gradient (torch: weight_decay of Adam)
-    max_norm: float | None = None  # of the gradient with its L2; None: not clipped
+    """Sequences in a training set that is drawn once, at least `batch_size`; None: fresh sequences
+    for every update."""
+    learning_rate: float = 0.01  # of Adam, at least 0
+    decay: float = 1.0  # factor of the learning rate from one update to the next, in [0, 1]
+    l2: float = 0.1
+    """This times the weights is added to the gradient, at least 0 (torch: weight_decay of Adam)."""
+    max_norm: float | None = None  # to which the gradient with its L2 is clipped, ≥ 0; None: not
     reduction: Literal["mean", "sum"] = eqx.field(static=True, default="mean")
-    """How the losses of a batch's questions become one."""
+    """How the losses of all questions in a batch become one number."""
     checkpoint: int | None = eqx.field(static=True, default=None)
-    """Steps from one carry that is kept to the next: what lies between is computed again for the
-    gradient. Less memory the nearer to √steps. None: 1 up to 1000 steps, then √steps."""
-    test_episodes: int = eqx.field(static=True, default=50)  # fresh ones, not counted
+    """Steps from one stored carry to the next, at least 1; what lies between is computed again for
+    the gradient. Memory is least near √steps. None: 1 up to 1000 steps, then √steps."""
+    test_episodes: int = eqx.field(static=True, default=50)  # fresh sequences per test, ≥ 1
 
     def __check_init__(self):
         if not isinstance(self.env, AbstractSequenceTask):
@@ -111,7 +115,7 @@ class BPTT(eqx.Module):
         50 updates on batches of 20 in place of one on 1000, no L2, a clipped gradient, a rate that
         falls (for longer runs `decay` nearer to 1). An MMU starts with its write gate closed."""
         if isinstance(network, MMU):
-            network = dataclasses.replace(network, start_weights="closed")
+            network = replace(network, start_weights="closed")
         settings = {"batch_size": 20, "updates": 50, "l2": 0.0, "max_norm": 0.1}
         settings |= {"learning_rate": 0.02, "decay": 0.9998}
         return cls.as_written(env, network, **settings | overrides)
@@ -123,6 +127,7 @@ class BPTT(eqx.Module):
 
     @float32()
     def init(self, *, key: PRNGKeyArray) -> BPTTState:
+        """A fresh network."""
         network_key, examples_key = jax.random.split(key)
         champion = self.network.init(*self.env.sizes, key=network_key)
         return BPTTState(champion, adam_state(champion), jnp.int32(0), examples_key)
@@ -154,8 +159,8 @@ class BPTT(eqx.Module):
 
 def kaiming(network: AbstractNetwork) -> Any:
     """The same network, its weights drawn Kaiming-normal (He et al. 2015), its biases 0."""
-    known = "initializer" in {field.name for field in dataclasses.fields(network)}
-    return dataclasses.replace(network, **{"initializer": "kaiming"} if known else {})
+    known = "initializer" in {field.name for field in fields(network)}
+    return replace(network, **{"initializer": "kaiming"} if known else {})
 
 
 @jit
@@ -174,7 +179,7 @@ def descend(
         gradient = jax.tree.map(lambda g, w: g + bptt.l2 * w, gradient, weights)
         rate = bptt.learning_rate * bptt.decay ** state.done.astype(jnp.float32)
         champion, optimizer = adam(state.champion, gradient, state.optimizer, rate, bptt.max_norm)
-        state = BPTTState(champion, optimizer, state.done + 1, state.examples)
+        state = replace(state, champion=champion, optimizer=optimizer, done=state.done + 1)
         return eqx.filter(state, eqx.is_array), (loss, jnp.sum(batch.length))
 
     keys = jax.random.split(key, bptt.updates)
@@ -186,9 +191,7 @@ def loss_of(policy: AbstractPolicy, bptt: BPTT, batch: Sequence) -> Float[Array,
     """Smooth L1 (Girshick 2015, equation 3) of the answers that were asked for."""
     targets, asked = jax.vmap(bptt.env.lesson)(batch)
     answers = respond(policy, batch.inputs, bptt.checkpoint)
-    distance = 0.5 * jnp.abs(answers - targets)  # at most 1, unless a target is beyond ±1
-    each = jnp.where(distance < 1.0, 0.5 * jnp.square(distance), distance - 0.5)
-    total = jnp.sum(asked * each)
+    total = jnp.sum(asked * optax.huber_loss(0.5 * (answers - targets)))
     return total if bptt.reduction == "sum" else total / jnp.sum(asked)
 
 

@@ -41,6 +41,7 @@ from ..rollout import Environment, evaluate
 from ..types import Metrics
 from .fitness import objective
 
+Members = Int[Array, "agents teams"]
 BREEDER = Breeder(elite_fraction=0.04, extinction=Extinction())
 
 
@@ -59,23 +60,17 @@ class CCEA(eqx.Module):
 
     env: Environment
     network: AbstractNetwork = MLP(hidden=(20,))  # of one agent
-    population_size: int = eqx.field(static=True, default=100)
-    """k: members of each population, at least 2."""
-    breeder: Breeder = BREEDER
-    """How the next population of each agent is made of this one."""
-    teams: int = eqx.field(static=True, default=5)
-    """φ: teams that an individual plays in, on average, at least 1."""
-    episodes: int = eqx.field(static=True, default=7)
-    """z: simulations of each team, averaged for its reward, at least 1."""
-    test_episodes: int = eqx.field(static=True, default=15)
-    """Fresh episodes in a test of the champion team, at least 1; their frames are not counted."""
+    population_size: int = eqx.field(static=True, default=100)  # k: members of each population, ≥ 2
+    breeder: Breeder = BREEDER  # how each population is followed by the next
+    teams: int = eqx.field(static=True, default=5)  # φ: teams of an individual, on average, ≥ 1
+    episodes: int = eqx.field(static=True, default=7)  # z: simulations of each team, ≥ 1
+    test_episodes: int = eqx.field(static=True, default=15)  # fresh ones per test, ≥ 1
     teaming: Literal["random", "balanced"] = eqx.field(static=True, default="random")
     """How teams are drawn: `random`, so that an individual plays in φ on average, or `balanced`, so
     that it plays in exactly φ."""
     assignment: Literal["mean", "best"] = eqx.field(static=True, default="mean")
     """Fitness of an individual: the `mean` over its teams, or the `best` of them."""
-    fitness: str | None = eqx.field(static=True, default=None)
-    """Name of the reward that is assigned; None: the task's first."""
+    fitness: str | None = eqx.field(static=True, default=None)  # reward's name; None: the first
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Policies see observations normalised by the running mean and variance of all observations so
     far, which are recorded for it; the champion keeps them."""
@@ -164,7 +159,7 @@ class CCEA(eqx.Module):
         }
         return CCEAState(populations, tree.take(champion, 0), moments), metrics
 
-    def drawn(self, *, key: PRNGKeyArray) -> Int[Array, "agents teams"]:
+    def drawn(self, *, key: PRNGKeyArray) -> Members:
         """Who is in which team."""
         k, agents = self.population_size, self.agents
         if agents == 1:
@@ -176,7 +171,7 @@ class CCEA(eqx.Module):
 
 
 @jit
-def drafted(ccea: CCEA, populations: PyTree, members: Int[Array, "agents teams"]) -> TeamPolicy:
+def drafted(ccea: CCEA, populations: PyTree, members: Members) -> TeamPolicy:
     """Teams `[teams, ...]` of these members of each population `[agents, k, ...]`."""
     heads = tuple(tree.take(populations, (i, members[i])) for i in range(ccea.agents))
     config = Team(trunk=(), head=ccea.network, sharing="nothing")
@@ -197,15 +192,11 @@ def breed(
 
 
 @jit
-def assigned(
-    ccea: CCEA,
-    members: Int[Array, "agents teams"],
-    returns: Float[Array, "teams episodes *agents"],
-) -> Float[Array, "agents k"]:
+def assigned(ccea: CCEA, members: Members, returns: Array) -> Float[Array, "agents k"]:
     """Fitness of every individual, from the teams that it was in; -inf if there was none.
 
-    **Arguments:** `members[i, t]`: who of population i is in team t. `returns` of a private signal
-    have an axis of agents.
+    **Arguments:** `members[i, t]`: who of population i is in team t. `returns` `[teams, episodes]`,
+    of a private reward `[teams, episodes, agents]`.
     """
     reward = jnp.mean(returns, axis=1)  # over simulations
     reward = reward.T if reward.ndim == 2 else jnp.broadcast_to(reward, members.shape)

@@ -33,7 +33,7 @@ from jaxtyping import PRNGKeyArray
 
 from .. import require
 from ..compilation import float32
-from ..evolution.breeder import Breeder, evolving
+from ..evolution.breeder import Breeder, evolving, overridden
 from ..evolution.mutation import MatrixMutation
 from ..learners.base import AbstractLearner
 from ..learners.manager import UCB, AbstractManager
@@ -73,32 +73,22 @@ class ERL(Hybrid):
     learners: tuple[AbstractLearner, ...] = (ddpg(),)
     """The portfolio: each learns from the experience of all. Empty: evolution alone."""
     population_size: int = eqx.field(static=True, default=10)  # k: members, at least 2
-    breeder: Breeder = BREEDER
-    """How the next population is made of this one."""
-    episodes: int = eqx.field(static=True, default=1)
-    """ξ: episodes averaged for one fitness value, at least 1."""
+    breeder: Breeder = BREEDER  # how the next population is made
+    episodes: int = eqx.field(static=True, default=1)  # ξ: averaged for one fitness value, ≥ 1
     remember: bool = eqx.field(static=True, default=False)
     """Rank a member by the average fitness over all generations that it lived through, not by the
     last one alone."""
     redistribute: bool = eqx.field(static=True, default=False)
     """Learners see each episode's return in equal parts over its frames, however late it came."""
-    workers: int = eqx.field(static=True, default=1)
-    """b: episodes that all learners together play per generation, at least 1."""
-    manager: AbstractManager | None = None
-    """How workers are allocated to learners; None: in turn, the same every generation."""
-    sync_period: int = eqx.field(static=True, default=10)
-    """ω: generations from one injection of the learners' actors to the next, at least 1."""
-    updates_per_frame: float = 1.0
-    """Gradient updates of each learner per environment frame of the generation, at least 0."""
-    warmup_frames: int = eqx.field(static=True, default=1_000)
-    """Frames played before learners begin to learn, at least 0."""
-    replay_capacity: int = eqx.field(static=True, default=1_000_000)
-    """Transitions in the replay buffer, at least 1; then the oldest are overwritten."""
-    test_episodes: int = eqx.field(static=True, default=5)
-    """Fresh episodes in a test of the champion, at least 1; their frames are not counted."""
-    test_every: int = eqx.field(static=True, default=1)  # generations between tests, at least 1
-    fitness: str | None = eqx.field(static=True, default=None)
-    """Name of the reward that fitness sums up; None: the task's first."""
+    workers: int = eqx.field(static=True, default=1)  # b: learners' episodes per generation, ≥ 1
+    manager: AbstractManager | None = None  # allocates workers to learners; None: they go in turn
+    sync_period: int = eqx.field(static=True, default=10)  # ω: generations between injections, ≥ 1
+    updates_per_frame: float = 1.0  # gradient updates of each learner per frame played, ≥ 0
+    warmup_frames: int = eqx.field(static=True, default=1_000)  # played before learning begins, ≥ 0
+    replay_capacity: int = eqx.field(static=True, default=1_000_000)  # transitions, ≥ 1
+    test_episodes: int = eqx.field(static=True, default=5)  # fresh ones per test, ≥ 1
+    test_every: int = eqx.field(static=True, default=1)  # generations from test to test, ≥ 1
+    fitness: str | None = eqx.field(static=True, default=None)  # reward's name; None: the first
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Policies see observations normalised by the running mean and variance of all observations so
     far; the champion keeps them."""
@@ -115,7 +105,7 @@ class ERL(Hybrid):
         ψ, ξ, ω = TABLE_5_1.get(name, TABLE_5_1["HalfCheetah"])
         settings: dict[str, Any] = {"elite_fraction": ψ, "episodes": ξ, "sync_period": ω}
         network = network or (ERL_NETWORK if env.agents is None else Team())
-        return cls(env, network, **evolving(BREEDER, settings | overrides))
+        return cls(env, network, **evolving(BREEDER, settings, overrides))
 
     @classmethod
     def ours(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
@@ -124,12 +114,12 @@ class ERL(Hybrid):
         elites, ranked by their average fitness. Chosen by looking at the hard double pendulum,
         seeds 0, 100 to 103 and 200 to 202."""
         network = network or MLP(hidden=(64, 64), activation="relu", initializer="uniform")
-        rates = {"actor_lr": 1e-3, "critic_lr": 1e-3, "batch_size": 128}
+        rates: dict[str, Any] = {"actor_lr": 1e-3, "critic_lr": 1e-3, "batch_size": 128}
         critic = Critic(hidden=(128, 128))
         learner = TD3(critic=critic, gamma=0.999, reward_scale=0.01, **rates)
         settings = {"learners": (learner,), "elite_fraction": 0.4, "sync_period": 1}
         settings |= {"remember": True, "redistribute": True, "updates_per_frame": 2.0}
-        return cls.erl(env, network, **settings | overrides)
+        return cls.erl(env, network, **overridden(settings, overrides))
 
     @classmethod
     def ea(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
@@ -143,7 +133,7 @@ class ERL(Hybrid):
         learners = tuple(TD3(gamma=γ) for γ in (0.9, 0.99, 0.997, 0.9995))
         settings = {"learners": learners, "workers": 10, "manager": UCB(), "elite_fraction": 0.2}
         settings |= {"sync_period": 5, "test_episodes": 10, "test_every": 5}
-        return cls(env, network or TD3_NETWORK, **evolving(BREEDER, settings | overrides))
+        return cls(env, network or TD3_NETWORK, **evolving(BREEDER, settings, overrides))
 
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
@@ -165,11 +155,10 @@ class ERL(Hybrid):
         state, bred = breed(self, state, average, key=breed_key)
 
         # 16-20: learners play too, with noise; their mean return is their value.
-        state, frames, explored = explore(self, state, key=explore_key)
-        frames = jnp.sum(played.steps) + frames
+        state, explored = explore(self, state, jnp.sum(played.steps), key=explore_key)
 
         # 21-29: as many updates as frames, each learner on minibatches of its own.
-        state, learned = improve(self, state, frames, key=learn_key)
+        state, learned = improve(self, state, explored["frames"], key=learn_key)
 
         # 30-33: allocate the workers of the next generation.
         if self.manager is not None and self.learners:
@@ -180,5 +169,4 @@ class ERL(Hybrid):
         due = (state.generation % self.sync_period == 0) & (learned["updates"] > 0)
         state = inject(self, state, due)
 
-        metrics = {"frames": frames} | bred | explored | learned
-        return tested(self, state, fitness, metrics, key=test_key)
+        return tested(self, state, fitness, bred | explored | learned, key=test_key)

@@ -4,7 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .. import require, tree
+from .. import require, rollout, tree
+from ..compilation import when
+from ..networks.base import AbstractPolicy
 from ..rollout import Environment
 
 
@@ -16,6 +18,12 @@ def objective(env: Environment, named: str | None = None) -> str:
     """
     require.signal(named, env.signals)
     return named or env.signals[0]
+
+
+def retested(env, champion: AbstractPolicy, episodes: int, due, score, *, key) -> Array:
+    """The champion's mean return on fresh episodes if a test is `due`, else the `score` from
+    before."""
+    return when(due, lambda: rollout.score(env, champion, episodes, key=key), lambda: score)
 
 
 class Parsimony(eqx.Module):

@@ -5,6 +5,7 @@ A population and learners play into one replay buffer. A generation is a sequenc
 actors into the population) and `tested` (the champion). Each takes a state and returns the next.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -14,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from .. import require, rollout, tree
-from ..compilation import float32, jit, when
+from .. import require, tree
+from ..compilation import float32, jit
 from ..evolution.breeder import Breeder, draw
 from ..evolution.selection import rankable, ranking
 from ..learners.base import AbstractLearner, learn
@@ -25,8 +26,13 @@ from ..normalization import Moments, behind, frozen, warmed, watched
 from ..replay import Replay, extend
 from ..rollout import Environment, blank, collect
 from ..types import Evaluation, Metrics
-from .fitness import objective
+from .fitness import objective, retested
 from .lineage import Lineage
+
+
+def _field(start: float, dtype: Callable[..., Any]) -> Any:
+    """A field of a state that starts with this number."""
+    return eqx.field(default_factory=lambda: dtype(start))
 
 
 class HybridState(eqx.Module):
@@ -39,12 +45,13 @@ class HybridState(eqx.Module):
     ledger: Ledger
     allocation: Int[Array, " b"]  # the learner of each rollout worker
     champion: AbstractPolicy  # the fittest of the last generation
-    score: Float[Array, ""]  # of the champion that was tested last
-    frames: Int[Array, ""]
-    episodes: Int[Array, ""]
-    generation: Int[Array, ""]
     moments: Moments | None  # of all observations; None: they are not normalised
     seen: Moments | None  # the same with what was seen in this generation, in the midst of one
+    score: Float[Array, ""] = _field(-jnp.inf, jnp.float32)
+    """Of the champion that was tested last; -inf: none was."""
+    frames: Int[Array, ""] = _field(0, jnp.int32)
+    episodes: Int[Array, ""] = _field(0, jnp.int32)
+    generation: Int[Array, ""] = _field(0, jnp.int32)
 
 
 class Hybrid(eqx.Module):
@@ -120,10 +127,6 @@ class Hybrid(eqx.Module):
             ledger=Ledger.empty(q),
             allocation=even(self.workers, max(q, 1)),
             champion=frozen(moments, tree.take(population, 0)),
-            score=jnp.float32(-jnp.inf),  # never tested
-            frames=jnp.int32(0),
-            episodes=jnp.int32(0),
-            generation=jnp.int32(0),
             moments=moments,
             seen=moments,
         )
@@ -143,6 +146,13 @@ class Hybrid(eqx.Module):
         )
 
 
+Key = PRNGKeyArray
+Fitness = Float[Array, " pop"]
+Frames = Int[Array, ""]
+Result = tuple[HybridState, Metrics]
+UNMANAGED = UCB()  # keeps the ledger of learners that play in turn
+
+
 def play(
     hybrid: Hybrid, state: HybridState, policies: PyTree, episodes: int, **how: Any
 ) -> tuple[HybridState, Evaluation]:
@@ -160,21 +170,16 @@ def play(
     return state, played
 
 
-def breed(
-    hybrid: Hybrid, state: HybridState, fitness: Float[Array, " pop"], *, key: PRNGKeyArray
-) -> tuple[HybridState, Metrics]:
+def breed(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key) -> Result:
     """The next population with its lineage, and the champion of this one."""
-    population, lineage, champion, metrics = bred(
-        hybrid, state.population, state.lineage, fitness, key=key
-    )
+    given = (state.population, state.lineage, fitness)
+    population, lineage, champion, metrics = bred(hybrid, *given, key=key)
     state = replace(state, population=population, lineage=lineage, generation=state.generation + 1)
     return replace(state, champion=frozen(state.moments, champion)), metrics
 
 
 @jit
-def bred(
-    hybrid: Hybrid, population: PyTree, lineage: Lineage, fitness: Array, *, key: PRNGKeyArray
-) -> tuple[PyTree, Lineage, AbstractPolicy, Metrics]:
+def bred(hybrid: Hybrid, population: PyTree, lineage: Lineage, fitness: Fitness, *, key: Key):
     """`breed` of what it needs, so that the replay buffer is not copied."""
     fresh = partial(draw, hybrid.network, hybrid.env.sizes)
     offspring, descent = hybrid.breeder(population, fitness, fresh, key=key)
@@ -183,29 +188,26 @@ def bred(
     return offspring, lineage.after(descent), tree.take(population, best), metrics
 
 
-def explore(
-    hybrid: Hybrid, state: HybridState, *, key: PRNGKeyArray
-) -> tuple[HybridState, Int[Array, ""], Metrics]:
+def explore(hybrid: Hybrid, state: HybridState, frames: Frames, *, key: Key) -> Result:
     """Each learner's workers play an episode with noise; the ledger gets their returns.
 
-    **Returns:** the state, the frames played, and which learner played how many episodes.
+    **Returns:** the state, and as metrics which learner played how many episodes, its value, and
+    the `frames` that were given and those that were played here.
     """
-    frames, metrics, workers = jnp.int32(0), {}, hybrid.workers
+    metrics, workers = {}, hybrid.workers
     for i, learner in enumerate(hybrid.learners):
         mine = jnp.sum((state.allocation == i).astype(jnp.int32))
         team = tree.stack(learner.explorer(state.learners[i], jnp.bool_(False)))
         how = {"wanted": mine, "common": False, "key": jax.random.fold_in(key, i)}
         state, played = play(hybrid, state, team, workers, **how)
         returns, theirs = played.of(hybrid.reward)[0], jnp.arange(workers) < mine
-        ledger = (hybrid.manager or UCB()).observe(state.ledger, i, returns, theirs)
+        ledger = (hybrid.manager or UNMANAGED).observe(state.ledger, i, returns, theirs)
         state, frames = replace(state, ledger=ledger), frames + jnp.sum(played.steps)
         metrics |= {f"workers_{i}": mine, f"value_{i}": ledger.value[i]}
-    return state, frames, metrics
+    return state, {"frames": frames} | metrics
 
 
-def improve(
-    hybrid: Hybrid, state: HybridState, frames: Int[Array, ""], *, key: PRNGKeyArray
-) -> tuple[HybridState, Metrics]:
+def improve(hybrid: Hybrid, state: HybridState, frames: Frames, *, key: Key) -> Result:
     """Each learner makes `updates_per_frame` updates for each of the generation's `frames`, on
     minibatches of its own from the common buffer. The state counts the generation's frames."""
     ready = (state.frames >= hybrid.warmup_frames) & bool(hybrid.learners)
@@ -240,15 +242,13 @@ def _injected(population: PyTree, lineage: Lineage, actors: list[PyTree], due: B
 
 
 def tested(
-    hybrid: Hybrid, state: HybridState, fitness: Array, metrics: Metrics, *, key: PRNGKeyArray
-) -> tuple[HybridState, Metrics]:
+    hybrid: Hybrid, state: HybridState, fitness: Fitness, metrics: Metrics, *, key: Key
+) -> Result:
     """The champion on fresh episodes, every `test_every` generations. **Returns:** the state with
     the score of the last test, and all metrics of the generation."""
-    score = when(
-        (state.generation - 1) % hybrid.test_every == 0,
-        lambda: rollout.score(hybrid.env, state.champion, hybrid.test_episodes, key=key),
-        lambda: state.score,
-    )
+    due = (state.generation - 1) % hybrid.test_every == 0
+    given = (state.champion, hybrid.test_episodes, due, state.score)
+    score = retested(hybrid.env, *given, key=key)
     metrics = {
         "fitness_max": jnp.max(rankable(fitness)),
         "fitness_mean": jnp.nanmean(fitness),

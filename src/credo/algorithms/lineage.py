@@ -48,9 +48,8 @@ class Lineage(eqx.Module):
         for mate, taken in zip(descent.mate.T, descent.taken.T[..., None], strict=True):
             share = (1.0 - taken) * share + taken * before[mate]
             before = share  # later mates are members of the new population
-        made = MUTATED * descent.mutated.astype(jnp.int32) + CROSSED * descent.crossed.astype(
-            jnp.int32
-        )
+        mutated, crossed = (x.astype(jnp.int32) for x in (descent.mutated, descent.crossed))
+        made = MUTATED * mutated + CROSSED * crossed
         made = jnp.where(made > 0, made, self.maker[parent])
         lived = (jnp.where(elite, x[parent], 0.0) for x in (self.earned, self.times))
         bred = Lineage(made, share, jnp.full_like(self.guest, -1), *lived)

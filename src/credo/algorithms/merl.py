@@ -56,29 +56,18 @@ class MERL(Hybrid):
 
     env: Environment
     network: AbstractNetwork = Team()
-    learners: tuple[AbstractLearner, ...] = (LOCAL,)
-    """Learners of the whole team, each of the reward that it names."""
+    learners: tuple[AbstractLearner, ...] = (LOCAL,)  # of the whole team, each of its own reward
     population_size: int = eqx.field(static=True, default=20)  # k: teams, at least 2
-    breeder: Breeder = BREEDER
-    """How the next population is made of this one."""
-    episodes: int = eqx.field(static=True, default=10)
-    """ξ: episodes averaged for one fitness value, at least 1."""
-    workers: int = eqx.field(static=True, default=50)
-    """Episodes that all learners together play per generation, in turn, at least 1."""
-    migration_period: int = eqx.field(static=True, default=1)
-    """Generations from one migration of the learners' teams to the next, at least 1."""
-    updates_per_frame: float = 0.1
-    """Gradient updates of each learner, for all agents together, per environment frame of the
-    generation, at least 0."""
-    warmup_frames: int = eqx.field(static=True, default=5_120)
-    """Frames played before learners begin to learn, at least 0."""
-    replay_capacity: int = eqx.field(static=True, default=100_000)
-    """Joint transitions in the replay buffer, at least 1; then the oldest are overwritten."""
-    test_episodes: int = eqx.field(static=True, default=10)
-    """Fresh episodes in a test of the champion, at least 1; their frames are not counted."""
-    test_every: int = eqx.field(static=True, default=1)  # generations between tests, at least 1
-    fitness: str | None = eqx.field(static=True, default=None)
-    """Name of the reward that fitness sums up; None: the task's first."""
+    breeder: Breeder = BREEDER  # how the next population is made
+    episodes: int = eqx.field(static=True, default=10)  # ξ: averaged for one fitness value, ≥ 1
+    workers: int = eqx.field(static=True, default=50)  # learners' episodes per generation, ≥ 1
+    migration_period: int = eqx.field(static=True, default=1)  # generations between migrations, ≥ 1
+    updates_per_frame: float = 0.1  # updates of each learner, for all agents, per frame played, ≥ 0
+    warmup_frames: int = eqx.field(static=True, default=5_120)  # played before learning begins, ≥ 0
+    replay_capacity: int = eqx.field(static=True, default=100_000)  # transitions, ≥ 1
+    test_episodes: int = eqx.field(static=True, default=10)  # fresh ones per test, ≥ 1
+    test_every: int = eqx.field(static=True, default=1)  # generations from test to test, ≥ 1
+    fitness: str | None = eqx.field(static=True, default=None)  # reward's name; None: the first
     redistribute: bool = eqx.field(static=True, default=False)
     """Learners see each episode's return in equal parts over its frames, however late it came."""
     normalize_observations: bool = eqx.field(static=True, default=False)
@@ -114,16 +103,14 @@ class MERL(Hybrid):
         state, bred = breed(self, state, fitness, key=breed_key)
 
         # 8: Rollout(π_pg, R, noise=W_g, ξ=1), in parallel worlds.
-        state, frames, explored = explore(self, state, key=explore_key)
-        frames = jnp.sum(played.steps) + frames
+        state, explored = explore(self, state, jnp.sum(played.steps), key=explore_key)
 
         # 15-21: for agent k: a minibatch from R^k; descend the critic's loss; follow the gradient
         # of Q with head k; move the targets.
-        state, learned = improve(self, state, frames, key=learn_key)
+        state, learned = improve(self, state, explored["frames"], key=learn_key)
 
         # 22: Migrate: the weakest teams become copies of π_pg.
         due = (state.generation % self.migration_period == 0) & (learned["updates"] > 0)
         state = inject(self, state, due)
 
-        metrics = {"frames": frames} | bred | explored | learned
-        return tested(self, state, fitness, metrics, key=test_key)
+        return tested(self, state, fitness, bred | explored | learned, key=test_key)

@@ -28,7 +28,7 @@ from ..environments.base import AbstractSequenceTask
 from ..environments.curriculum import Curriculum
 from ..environments.sequence_classification import SequenceClassification
 from ..evolution.agents import AgentCrossover, apart
-from ..evolution.breeder import Breeder, draw, evolving
+from ..evolution.breeder import Breeder, draw, evolving, overridden
 from ..evolution.crossover import NoCrossover, OnePointCrossover
 from ..evolution.extinction import Extinction
 from ..evolution.mutation import MatrixMutation
@@ -52,13 +52,18 @@ def _names(signals: str | tuple[str, ...]) -> tuple[str, ...]:
     return (signals,) if isinstance(signals, str) else tuple(signals)
 
 
+Fitness = Float[Array, " pop"]
+
+
 class NeuroevolutionState(eqx.Module):
+    """What Neuroevolution knows between two generations."""
+
     population: PyTree  # leaves [pop, ...]; bred, not yet evaluated
     champion: PyTree  # the best of the generation before
-    record: Float[Array, " pop"]  # running mean of a member's fitness in earlier generations
+    record: Fitness  # running mean of a member's fitness in earlier generations
     age: Int[Array, " pop"]  # how many generations that mean counts for; 0: bred just now
     level: Int[Array, ""]  # of the curriculum
-    moments: Moments | None  # of what was seen; None: observations are as they are
+    moments: Moments | None  # of all observations; None: they are not normalised
 
 
 class Neuroevolution(eqx.Module):
@@ -67,20 +72,14 @@ class Neuroevolution(eqx.Module):
     env: Environment
     network: AbstractNetwork
     population_size: int = eqx.field(static=True, default=100)  # k: members, at least 2
-    breeder: Breeder = Breeder()
-    """How the next population is made of this one."""
-    episodes: int = eqx.field(static=True, default=10)
-    """Episodes averaged for one fitness value, the same for all members, at least 1."""
-    test_episodes: int = eqx.field(static=True, default=50)
-    """Fresh episodes in the test of the champion, at least 1; their frames are not counted."""
+    breeder: Breeder = Breeder()  # how the next population is made
+    episodes: int = eqx.field(static=True, default=10)  # averaged for one fitness value, ≥ 1
+    test_episodes: int = eqx.field(static=True, default=50)  # fresh ones per test, ≥ 1
     elite_memory: int = eqx.field(static=True, default=1)
-    """Generations over which an elite's fitness is averaged, at least 1; after that many the newest
-    counts one such part. 1: the last generation alone. Levels of a curriculum are not told apart.
-    """
-    curriculum: Curriculum | None = None
-    """A shorter task at first; None: the whole task from the start."""
-    parsimony: Parsimony | None = None
-    """Bonus for simple networks, times their score; None: no bonus."""
+    """Generations over which an elite's fitness is averaged, ≥ 1; after so many the newest counts
+    one such part. 1: the last generation alone."""
+    curriculum: Curriculum | None = None  # a shorter task at first; None: all of it from the start
+    parsimony: Parsimony | None = None  # bonus for simple networks, times their score; None: none
     fitness: tuple[str, ...] = eqx.field(static=True, default=(), converter=_names)
     """Names of the rewards whose sum is the fitness; none: the task's first."""
     score: str | None = eqx.field(static=True, default=None)
@@ -129,7 +128,7 @@ class Neuroevolution(eqx.Module):
             }
         if isinstance(network, MMU):
             network = replace(network, start_weights="saturated")
-        return cls.as_coded(env, network, **settings | overrides)
+        return cls.as_coded(env, network, **overridden(settings, overrides))
 
     @classmethod
     def dmmu(cls, env: Environment, network: AbstractNetwork, **overrides) -> Self:
@@ -142,7 +141,7 @@ class Neuroevolution(eqx.Module):
             mating=(OnePointCrossover(), *((AgentCrossover(),) if apart(network) else ())),
             extinction=Extinction(),
         )
-        return cls(env, network, **evolving(breeder, {"test_episodes": 10} | overrides))
+        return cls(env, network, **evolving(breeder, {"test_episodes": 10}, overrides))
 
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
@@ -209,7 +208,7 @@ class Neuroevolution(eqx.Module):
 @jit
 def assess(
     algorithm: Neuroevolution, state: NeuroevolutionState, evaluation: Evaluation
-) -> tuple[Float[Array, " pop"], Float[Array, " pop"]]:
+) -> tuple[Fitness, Fitness]:
     """Fitness, with earlier generations of an elite mixed in; and that of this one alone."""
     rewards = algorithm.fitness or (objective(algorithm.env),)
     total = jnp.stack([evaluation.of(name) for name in rewards]).sum(axis=0)
@@ -225,12 +224,8 @@ def assess(
 
 @jit
 def breed(
-    algorithm: Neuroevolution,
-    state: NeuroevolutionState,
-    fitness: Float[Array, " pop"],
-    *,
-    key: PRNGKeyArray,
-) -> tuple[PyTree, Float[Array, " pop"], Int[Array, " pop"]]:
+    algorithm: Neuroevolution, state: NeuroevolutionState, fitness: Fitness, *, key: PRNGKeyArray
+) -> tuple[PyTree, Fitness, Int[Array, " pop"]]:
     """The next population; record and age of its elites, and none of its offspring."""
     fresh = partial(draw, algorithm.network, algorithm.env.sizes)
     population, descent = algorithm.breeder(state.population, fitness, fresh, key=key)

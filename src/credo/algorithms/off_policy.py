@@ -6,15 +6,16 @@ makes as many updates as frames were played, so that its end is a state to resum
 """
 
 from collections.abc import Callable
-from typing import ClassVar, Self
+from dataclasses import replace
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from .. import require, rollout, tree
-from ..compilation import float32, when
+from .. import require, tree
+from ..compilation import float32
 from ..learners.base import AbstractLearner, learn
 from ..learners.sac import SAC
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, TEAM, ddpg, maddpg, matd3
@@ -24,15 +25,18 @@ from ..normalization import Moments, behind, frozen, warmed, watched
 from ..replay import Replay, extend
 from ..rollout import Environment, blank, collect
 from ..types import Metrics
+from .fitness import objective, retested
 
 
 class OffPolicyState(eqx.Module):
+    """What a learner alone knows between two generations."""
+
     learner: PyTree
     replay: Replay
     champion: AbstractPolicy  # the actor
-    score: Float[Array, ""]  # of its last test
+    score: Float[Array, ""]  # of its last test; -inf: none
     frames: Int[Array, ""]
-    moments: Moments | None  # of what was seen; None: observations are as they are
+    moments: Moments | None  # of all observations; None: they are not normalised
 
 
 class OffPolicy(eqx.Module):
@@ -43,17 +47,17 @@ class OffPolicy(eqx.Module):
     env: Environment
     network: AbstractNetwork = TD3_NETWORK
     learner: AbstractLearner = TD3()
-    episodes: int = eqx.field(static=True, default=1)  # played between updates
-    start_frames: int = eqx.field(static=True, default=25_000)  # of random actions at first
-    updates_per_frame: float = 1.0
+    episodes: int = eqx.field(static=True, default=1)  # played between rounds of updates, ≥ 1
+    start_frames: int = eqx.field(static=True, default=25_000)  # with random actions at first, ≥ 0
+    updates_per_frame: float = 1.0  # gradient updates per environment frame, at least 0
     redistribute: bool = eqx.field(static=True, default=False)
     """The learner sees each episode's return in equal parts over its frames."""
-    test_episodes: int = eqx.field(static=True, default=10)  # without noise; not counted
-    test_every: int = eqx.field(static=True, default=5_000)  # frames between tests
-    replay_capacity: int = eqx.field(static=True, default=1_000_000)  # transitions
+    test_episodes: int = eqx.field(static=True, default=10)  # fresh ones per test, ≥ 1
+    test_every: int = eqx.field(static=True, default=5_000)  # frames between tests, at least 1
+    replay_capacity: int = eqx.field(static=True, default=1_000_000)  # transitions, ≥ 1
     normalize_observations: bool = eqx.field(static=True, default=False)
-    """Actor and critics see observations by the running mean and variance of all that was seen; the
-    champion keeps them."""
+    """Actor and critics see observations normalised by the running mean and variance of all
+    observations so far; the champion keeps them."""
 
     def __check_init__(self):
         for name in ("episodes", "test_episodes", "test_every", "replay_capacity"):
@@ -61,7 +65,7 @@ class OffPolicy(eqx.Module):
         require.fits(self.env, self.network, self.learner)
         require.at_least("start_frames", self.start_frames, 0)
         require.at_least("updates_per_frame", self.updates_per_frame, 0)
-        require.signal(self.learner.signal, self.env.signals)
+        objective(self.env, self.learner.signal)
 
     @classmethod
     def td3(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
@@ -108,35 +112,40 @@ class OffPolicy(eqx.Module):
 
     @float32()
     def init(self, *, key: PRNGKeyArray) -> OffPolicyState:
+        """A fresh learner and an empty replay buffer."""
         env = self.env
         require.continuous(env, self.learner)
         learner = self.learner.init(self.network, *env.sizes, key=key)
-        replay = Replay.empty(blank(env), self.replay_capacity)
         moments = Moments.first(env, self.network) if self.normalize_observations else None
-        actor = frozen(moments, self.learner.actor(learner))
-        counted = (jnp.float32(-jnp.inf), jnp.int32(0), moments)
-        return OffPolicyState(learner, replay, actor, *counted)
+        return OffPolicyState(
+            learner=learner,
+            replay=Replay.empty(blank(env), self.replay_capacity),
+            champion=frozen(moments, self.learner.actor(learner)),
+            score=jnp.float32(-jnp.inf),
+            frames=jnp.int32(0),
+            moments=moments,
+        )
 
     def warm(self, state: OffPolicyState, policy: AbstractPolicy) -> OffPolicyState:
         """`state` that goes on from a saved policy of the same network, without random actions. Its
         critics are new."""
         actor, moments = warmed(policy, state.moments)
         learner = self.learner.warm(state.learner, actor)
-        frames = jnp.int32(self.start_frames)
-        return OffPolicyState(learner, state.replay, policy, state.score, frames, moments)
+        state = replace(state, learner=learner, champion=policy, moments=moments)
+        return replace(state, frames=jnp.int32(self.start_frames))
 
     @float32()
-    def generation(
-        self, state: OffPolicyState, *, key: PRNGKeyArray
-    ) -> tuple[OffPolicyState, Metrics]:
+    def generation(self, state: OffPolicyState, *, key: Any) -> tuple[OffPolicyState, Metrics]:
+        """Play, learn, and test now and then."""
         explore_key, learn_key, test_key = jax.random.split(key, 3)
 
         # Act with noise (at first at random), and remember every transition.
-        explorer = self.learner.explorer(state.learner, state.frames < self.start_frames)
-        explorers = behind(state.moments, tree.stack(explorer))
-        played, experience = collect(
-            self.env, explorers, self.episodes, common=False, key=explore_key
+        explorer = tree.stack(
+            self.learner.explorer(state.learner, state.frames < self.start_frames)
         )
+        how = {"common": False, "key": explore_key}
+        explorer = behind(state.moments, explorer)
+        played, experience = collect(self.env, explorer, self.episodes, **how)
         moments = watched(state.moments, experience)
         experience = experience.spread(played) if self.redistribute else experience
         replay = extend(state.replay, experience.transitions, experience.valid)
@@ -144,23 +153,21 @@ class OffPolicy(eqx.Module):
         frames = state.frames + new
 
         # Learn from minibatches, once random actions are over.
-        total = jnp.floor(frames.astype(jnp.float32) * self.updates_per_frame)
-        before = jnp.floor(state.frames.astype(jnp.float32) * self.updates_per_frame)
+        total, before = (
+            jnp.floor(x.astype(jnp.float32) * self.updates_per_frame)
+            for x in (frames, state.frames)
+        )
         updates = jnp.where(frames > self.start_frames, total - before, 0.0).astype(jnp.int32)
-        signal = self.env.signals[0]
-        given = {"signal": signal, "moments": moments, "key": learn_key}
+        reward = objective(self.env, self.learner.signal)
+        given = {"signal": reward, "moments": moments, "key": learn_key}
         learner, metrics = learn(self.learner, state.learner, replay, updates, **given)
 
         # Test the actor without noise, now and then.
         actor = frozen(moments, self.learner.actor(learner))
         due = frames // self.test_every > state.frames // self.test_every
-        due = due | ~jnp.isfinite(state.score)  # -inf: never tested
-        score = when(
-            due,
-            lambda: rollout.score(self.env, actor, self.test_episodes, key=test_key),
-            lambda: state.score,
-        )
-        returns = played.of(self.learner.signal or signal)
+        due = due | ~jnp.isfinite(state.score)
+        score = retested(self.env, actor, self.test_episodes, due, state.score, key=test_key)
+        returns = played.of(reward)
         metrics |= {
             "fitness_max": jnp.max(returns),
             "fitness_mean": jnp.mean(returns),
@@ -168,4 +175,5 @@ class OffPolicy(eqx.Module):
             "frames": new,
             "updates": updates,
         }
-        return OffPolicyState(learner, replay, actor, score, frames, moments), metrics
+        state = replace(state, learner=learner, replay=replay, champion=actor)
+        return replace(state, score=score, frames=frames, moments=moments), metrics

@@ -9,6 +9,7 @@ clipped gradient, the first deviation and the tanh around the mean are not the p
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -17,8 +18,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from .. import require, rollout, tree
-from ..compilation import float32, jit, when
+from .. import require, tree
+from ..compilation import float32, jit
 from ..learners.base import act, adam, adam_state, averaged, require_memoryless
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import Explorer, GaussianNoise
@@ -27,6 +28,7 @@ from ..normalization import Moments, behind, frozen, seen, warmed, watched
 from ..replay import Replay, extend
 from ..rollout import Environment, blank, collect
 from ..types import Metrics, Transition
+from .fitness import objective, retested
 
 
 class Actor(eqx.Module):
@@ -43,6 +45,9 @@ class Actor(eqx.Module):
         return jnp.sum(each, axis=1)
 
 
+Networks = tuple[Actor, CriticNetwork]
+
+
 class Sample(eqx.Module):
     """What an update learns from, one row per frame."""
 
@@ -54,15 +59,17 @@ class Sample(eqx.Module):
 
 
 class PPOState(eqx.Module):
+    """What PPO knows between two generations."""
+
     actor: Actor
     critic: CriticNetwork
     optimizer: optax.OptState
     replay: Replay  # the frames of one generation
     champion: AbstractPolicy
-    score: Float[Array, ""]
+    score: Float[Array, ""]  # of the champion's last test; -inf: none
     length: Float[Array, ""]  # mean frames of an episode, last time
     frames: Int[Array, ""]
-    moments: Moments | None  # of what was seen; None: observations are as they are
+    moments: Moments | None  # of all observations; None: they are not normalised
 
 
 class PPO(eqx.Module):
@@ -76,23 +83,23 @@ class PPO(eqx.Module):
         hidden=(64, 64), activation="tanh", initializer="fan_in", output_scale=0.01
     )
     critic: Critic = Critic(hidden=(64, 64), activation="tanh", initializer="fan_in")
-    horizon: int = eqx.field(static=True, default=2048)  # frames between updates, about
-    copies: int = eqx.field(static=True, default=32)  # episodes between updates, at most
-    epochs: int = eqx.field(static=True, default=10)  # passes over the frames
-    batch_size: int = eqx.field(static=True, default=64)  # frames per update
-    gamma: float = 0.99  # discount per step, in [0, 1]
+    horizon: int = eqx.field(static=True, default=2048)  # frames between updates, about, ≥ 1
+    copies: int = eqx.field(static=True, default=32)  # episodes between rounds, at most; ≥ 1
+    epochs: int = eqx.field(static=True, default=10)  # passes over these frames, at least 1
+    batch_size: int = eqx.field(static=True, default=64)  # frames per update, at least 1
+    gamma: float = 0.99  # γ: discount per step, in [0, 1]
     gae: float = 0.95  # λ of generalized advantages, in [0, 1]
-    clip: float = 0.2  # ε: how far a probability ratio counts
-    learning_rate: float = 3e-4  # of Adam
-    value_weight: float = 0.5  # of the critic's squared error
-    max_norm: float = 0.5  # of the gradient
-    first_std: float = 0.6  # of the noise at first, in units of actions
-    test_episodes: int = eqx.field(static=True, default=10)  # without noise; not counted
-    test_every: int = eqx.field(static=True, default=5_000)  # frames between tests
-    signal: str | None = eqx.field(static=True, default=None)  # reward; None: the task's first
+    clip: float = 0.2  # ε: how far from 1 a probability ratio counts, at least 0
+    learning_rate: float = 3e-4  # of Adam, at least 0
+    value_weight: float = 0.5  # of the critic's squared error in the loss, at least 0
+    max_norm: float = 0.5  # norm to which the gradient is clipped, at least 0
+    first_std: float = 0.6  # of the noise at first, ≥ 0, in units of actions, which lie in [-1, 1]
+    test_episodes: int = eqx.field(static=True, default=10)  # fresh ones per test, ≥ 1
+    test_every: int = eqx.field(static=True, default=5_000)  # frames between tests, at least 1
+    signal: str | None = eqx.field(static=True, default=None)  # reward's name; None: the first
     normalize_observations: bool = eqx.field(static=True, default=False)
-    """Actor and critic see observations by the running mean and variance of all that was seen; the
-    champion keeps them."""
+    """Actor and critic see observations normalised by the running mean and variance of all
+    observations so far; the champion keeps them."""
 
     def __check_init__(self):
         require.fits(self.env, self.network, self)
@@ -102,7 +109,7 @@ class PPO(eqx.Module):
             require.within(name, getattr(self, name), 0, 1)
         for name in ("clip", "learning_rate", "value_weight", "max_norm", "first_std"):
             require.at_least(name, getattr(self, name), 0)
-        require.signal(self.signal, self.env.signals)
+        objective(self.env, self.signal)
 
     @classmethod
     def ppo(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
@@ -117,6 +124,7 @@ class PPO(eqx.Module):
 
     @float32()
     def init(self, *, key: PRNGKeyArray) -> PPOState:
+        """Fresh networks, and room for the frames of one generation."""
         env = self.env
         require.continuous(env, self)
         actor_key, critic_key = jax.random.split(key)
@@ -125,33 +133,32 @@ class PPO(eqx.Module):
         actor = Actor(mean, jnp.full(env.action_size, jnp.log(self.first_std)))
         critic = self.critic.init(env.obs_size, 0, key=critic_key)  # a value of states
         # Room for a round of episodes that are all much longer than the last ones.
-        most = self.copies * env.max_steps
-        replay = Replay.empty(blank(env), min(most, self.horizon + 8 * env.max_steps))
-        opt = adam_state((actor, critic))
-        length = jnp.float32(min(self.horizon, env.max_steps))
-        score = jnp.float32(-jnp.inf)
+        most = min(self.copies * env.max_steps, self.horizon + 8 * env.max_steps)
         moments = Moments.first(env, self.network) if self.normalize_observations else None
-        rest = (score, length, jnp.int32(0), moments)
-        return PPOState(actor, critic, opt, replay, frozen(moments, mean), *rest)
+        return PPOState(
+            actor=actor,
+            critic=critic,
+            optimizer=adam_state((actor, critic)),
+            replay=Replay.empty(blank(env), most),
+            champion=frozen(moments, mean),
+            score=jnp.float32(-jnp.inf),
+            length=jnp.float32(min(self.horizon, env.max_steps)),
+            frames=jnp.int32(0),
+            moments=moments,
+        )
 
     @float32()
     def generation(self, state: PPOState, *, key: PRNGKeyArray) -> tuple[PPOState, Metrics]:
+        """Play, learn, and test now and then."""
         explore_key, learn_key, test_key = jax.random.split(key, 3)
 
         # Run the policy for about T frames.
         wanted = jnp.clip(jnp.ceil(self.horizon / state.length).astype(jnp.int32), 1, self.copies)
-        noise = GaussianNoise(jnp.exp(state.actor.log_std))  # pyright: ignore[reportArgumentType]
-        explorer = Explorer(
-            state.actor.mean, noise, jnp.bool_(False), self.env.action_size, clipped=False
-        )
-        played, experience = collect(
-            self.env,
-            behind(state.moments, tree.stack(explorer)),
-            self.copies,
-            wanted=wanted,
-            common=False,
-            key=explore_key,
-        )
+        std: Any = jnp.exp(state.actor.log_std)
+        explorer = (state.actor.mean, GaussianNoise(std), jnp.bool_(False), self.env.action_size)
+        explorer = behind(state.moments, tree.stack(Explorer(*explorer, clipped=False)))
+        how = {"wanted": wanted, "common": False, "key": explore_key}
+        played, experience = collect(self.env, explorer, self.copies, **how)
         empty = Replay(state.replay.data, jnp.int32(0))
         replay = extend(empty, experience.transitions, experience.valid)
         new = jnp.sum(played.steps)
@@ -164,46 +171,38 @@ class PPO(eqx.Module):
         )
         champion, moments = frozen(state.moments, actor.mean), watched(state.moments, experience)
 
+        # Test the policy without noise, now and then.
         due = frames // self.test_every > state.frames // self.test_every
-        due = due | ~jnp.isfinite(state.score)  # -inf: never tested
-        score = when(
-            due,
-            lambda: rollout.score(self.env, champion, self.test_episodes, key=test_key),
-            lambda: state.score,
-        )
-        returns = played.returns[self.signal or self.env.signals[0]][0]
-        counts = jnp.arange(self.copies) < wanted
+        due = due | ~jnp.isfinite(state.score)
+        score = retested(self.env, champion, self.test_episodes, due, state.score, key=test_key)
+        returns = played.returns[objective(self.env, self.signal)][0]
+        length = new.astype(jnp.float32) / wanted.astype(jnp.float32)
         metrics |= {
-            "fitness_max": jnp.max(jnp.where(counts, returns, -jnp.inf)),
+            "fitness_max": jnp.max(jnp.where(jnp.arange(self.copies) < wanted, returns, -jnp.inf)),
             "fitness_mean": jnp.sum(returns) / wanted.astype(jnp.float32),
             "champion_score": score,
             "frames": new,
         }
-        length = new.astype(jnp.float32) / wanted.astype(jnp.float32)
-        rest = (champion, score, length, frames, moments)
-        return PPOState(actor, critic, opt, replay, *rest), metrics
+        state = replace(state, actor=actor, critic=critic, optimizer=opt, replay=replay)
+        state = replace(state, champion=champion, score=score, length=length, frames=frames)
+        return replace(state, moments=moments), metrics
 
     def warm(self, state: PPOState, policy: AbstractPolicy) -> PPOState:
         """`state` that goes on from a saved policy of the same network."""
         mean, moments = warmed(policy, state.moments)
-        parts = (mean, policy, moments)
-        return eqx.tree_at(
-            lambda s: (s.actor.mean, s.champion, s.moments),
-            state,
-            parts,
-            is_leaf=lambda x: x is None,
-        )
+        actor = Actor(mean, state.actor.log_std)
+        return replace(state, actor=actor, champion=policy, moments=moments)
 
 
 @jit
 def improve(
     ppo: PPO,
-    networks: tuple[Actor, CriticNetwork],
-    optimizer: optax.OptState,
+    networks: Networks,
+    opt: optax.OptState,
     replay: Replay,
-    moments: Moments | None = None,
+    moments: Any = None,
     *,
-    key: PRNGKeyArray,
+    key: Any,
 ) -> tuple[Actor, CriticNetwork, optax.OptState, Metrics]:
     """K epochs of minibatches of M frames. How many frames there are is data."""
     sample = prepare(ppo, networks, replay, moments)
@@ -228,24 +227,18 @@ def improve(
         return jax.lax.fori_loop(0, batches, step, loop)
 
     zeros = {name: jnp.float32(0.0) for name in ("policy_loss", "critic_loss", "clipped")}
-    loop = jax.lax.fori_loop(0, ppo.epochs, epoch, (weights, optimizer, zeros))
-    weights, opt, total = loop
+    weights, opt, total = jax.lax.fori_loop(0, ppo.epochs, epoch, (weights, opt, zeros))
     actor, critic = eqx.combine(weights, static)
     return actor, critic, opt, averaged(total, ppo.epochs * batches)
 
 
-def prepare(
-    ppo: PPO,
-    networks: tuple[Actor, CriticNetwork],
-    replay: Replay,
-    moments: Moments | None = None,
-) -> Sample:
+def prepare(ppo: PPO, networks: Networks, replay: Replay, moments: Moments | None = None) -> Sample:
     """Advantages by equation 11 and what goes with them, normalised over the frames; observations
     as they were when the policy acted."""
     actor, critic = networks
     rows: Transition = replay.data
     filled = jnp.arange(replay.capacity) < replay.size
-    reward = rows.rewards[ppo.signal or ppo.env.signals[0]]
+    reward = rows.rewards[objective(ppo.env, ppo.signal)]
     obs, next_obs = seen(moments, rows.obs), seen(moments, rows.next_obs)
     value, after = _value(critic, obs), _value(critic, next_obs)
     delta = reward + ppo.gamma * jnp.where(rows.terminated, 0.0, after) - value
@@ -277,9 +270,7 @@ def advantages(
     return jax.lax.scan(back, jnp.float32(0.0), (delta, goes_on), reverse=True)[1]
 
 
-def surrogate(
-    ppo: PPO, networks: tuple[Actor, CriticNetwork], rows: Sample
-) -> tuple[Float[Array, ""], Metrics]:
+def surrogate(ppo: PPO, networks: Networks, rows: Sample) -> tuple[Float[Array, ""], Metrics]:
     """Minus the clipped objective (equation 7) and the critic's squared error."""
     actor, critic = networks
     ratio = jnp.exp(actor.log_density(rows.obs, rows.action) - rows.log_density)

@@ -20,12 +20,12 @@ class AgentCrossover(AbstractCrossover):
     """Each agent of the team `a` is replaced, with chance `probability`, by one of `b`: a copy in
     one direction (Khadka 2019, Algorithm 5, line 23).
 
-    `source`: the agent with the same index, or any of them (as coded). The genomes are policies of
-    teams whose agents have weights of their own.
+    The genomes are policies of teams whose agents have weights of their own.
     """
 
-    probability: float = 0.05  # of each agent, in [0, 1]
+    probability: float = 0.05  # chance that an agent is replaced, in [0, 1]
     source: Literal["same", "any"] = eqx.field(static=True, default="same")
+    """By which agent of the other team: the one with the `same` index, or `any` (as coded)."""
 
     def __check_init__(self):
         require.choice("source", self.source, ("same", "any"))
@@ -44,11 +44,11 @@ class AgentCrossover(AbstractCrossover):
 
 class Homogenize(AbstractMutation):
     """With chance `probability` a random agent of a team overwrites each other one with chance
-    `share`: what one has found, others have too. Of the author's code for DMMU; the dissertation
-    does not mention it. The genome is a policy whose agents have weights of their own."""
+    `share`, which spreads what one agent has found. From the author's code for DMMU; the
+    dissertation does not mention it. The genome is a policy whose agents have their own weights."""
 
-    probability: float = 0.005  # per genome, in [0, 1]
-    share: float = 0.5  # of the other agents, in [0, 1]
+    probability: float = 0.005  # chance per genome that it happens, in [0, 1]
+    share: float = 0.5  # chance that another agent is then overwritten, in [0, 1]
 
     def __check_init__(self):
         require.within("probability", self.probability, 0, 1)

@@ -23,8 +23,14 @@ from .islands import Islands
 from .mutation import AbstractMutation, MatrixMutation
 from .selection import AbstractSelection, Tournament, ranking, repeated
 
-Rows = PyTree
-"""A population as few arrays, see `tree.packed`."""
+Key = PRNGKeyArray
+Fitness = Float[Array, " pop"]
+Draw = Callable[..., Any]  # (n, key=key) -> n fresh members
+Rows = PyTree  # a population as few arrays, see `tree.packed`
+Each = Callable[..., Rows]  # (operator, *parents, key=key) -> children, all of them packed
+
+
+Bred = tuple[PyTree, Descent]
 
 
 class Breeder(eqx.Module):
@@ -88,14 +94,7 @@ class Breeder(eqx.Module):
         n = self.islands.number if self.islands else 1
         return n * int(self.elite_fraction * (population // n))
 
-    def __call__(
-        self,
-        population: PyTree,
-        fitness: Float[Array, " pop"],
-        draw: Callable[..., PyTree],
-        *,
-        key: PRNGKeyArray,
-    ) -> tuple[PyTree, Descent]:
+    def __call__(self, population: PyTree, fitness: Fitness, draw: Draw, *, key: Key) -> Bred:
         """The next population, of the same size, and where each member comes from.
 
         **Arguments:** `fitness` is maximised; NaN ranks last. `draw(n, key=key)` makes `n` fresh
@@ -103,27 +102,15 @@ class Breeder(eqx.Module):
         nothing reads of the descent.
         """
         rows, each, unpack = tree.packed(population)
+        breed = partial(self._breed_apart, self.islands) if self.islands else self._breed
+        rows, descent = breed(rows, each, partial(self._fresh, draw), fitness, key=key)
+        return unpack(rows), descent
 
-        def fresh(n: int, key: PRNGKeyArray) -> tuple[Rows, Descent]:
-            return tree.packed(draw(n, key=key))[0], self._unchanged(jnp.full(n, -1), False)
-
-        breed = partial(self._breed, each, fresh)
-        if self.islands is None:
-            rows, descent = breed(rows, fitness, key=key)
-            return unpack(rows), descent
-        breed_key, fresh_key = jax.random.split(key)
-        size = self.islands.size(k := fitness.shape[0])
-        anew = partial(fresh, size, fresh_key)
-        rows, descent = self.islands(breed, anew, rows, fitness, key=breed_key)
-        return unpack(rows), descent.shifted(jnp.arange(k) // size * size)
-
-    def _breed(
-        self, each: Callable[..., Rows], fresh: Callable[..., Any], rows: Rows, fitness, *, key
-    ) -> tuple[Rows, Descent]:
-        """The next generation of one island."""
+    def _breed(self, rows: Rows, each: Each, fresh: Draw, fitness: Fitness, *, key: Key) -> Bred:
+        """The next generation of a population that is not in islands."""
         k = fitness.shape[0]
         n = k - (e := int(self.elite_fraction * k))
-        keys, mating_keys = self._keys(key)
+        keys = self._keys(key)
         # Rank the population, keep the elites, select the parents of the others.
         order = ranking(fitness)
         if not self.selection.sees_fitness:
@@ -131,31 +118,59 @@ class Breeder(eqx.Module):
         parent = self.selection(fitness, n, key=keys["select"])
         if self.ordered:
             parent = parent[jnp.argsort(jnp.argsort(order)[parent], stable=True)]
-        # Cross some offspring with an elite; mutate all; cross all with each other.
+        # Cross some offspring with an elite; mutate all.
         mate = order[jax.random.randint(keys["mate"], (n,), 0, max(e, 1))]
         crossed = self._crossed(parent, e, key=keys["chance"])
         first, second = tree.take(rows, mate), tree.take(rows, parent)
         children = each(self.crossover, first, second, key=keys["cross"])
         offspring = jax.vmap(tree.where)(crossed, children, second)
-        crossings = [(mate, _taken(offspring, first, second))]
         mutants = each(self.mutation, offspring, key=keys["mutate"])
-        mutated = jnp.any(mutants[0] != offspring[0], axis=1)
-        for operator, mating_key in zip(self.mating, mating_keys, strict=True):
-            mutants, mate, taken = _mated(each, operator, mutants, key=mating_key)
-            crossings.append((e + mate, taken))
-            crossed = crossed | (taken > 0.0)
-        mates, taken = (jnp.stack(x, axis=1) for x in zip(*crossings, strict=True))
-        bred = mutants, Descent(parent, jnp.zeros(n, bool), crossed, mutated, mates, taken)
-        # Now and then some offspring die.
+        changed = jnp.any(mutants[0] != offspring[0], axis=1)
+        taken = _taken(offspring, first, second)[:, None]
+        descent = Descent(parent, jnp.zeros(n, bool), crossed, changed, mate[:, None], taken)
+        # Cross all with each other; now and then some die.
+        if self.mating:
+            mutants, descent = self._mated(mutants, each, descent, e, keys["mating"])
         if self.extinction is not None:
-            anew = partial(fresh, n, keys["fresh"])
-            bred = self.extinction(bred, anew, key=keys["extinct"])
-        elites = order[:e]
-        return tree.concat((tree.take(rows, elites), self._unchanged(elites, True)), bred)
+            anew = partial(fresh, n, key=keys["fresh"])
+            mutants, descent = self.extinction((mutants, descent), anew, key=keys["extinct"])
+        elites = tree.take(rows, order[:e]), self._unchanged(order[:e], True)
+        return tree.concat(elites, (mutants, descent))
 
-    def _keys(self, key: PRNGKeyArray) -> tuple[dict[str, PRNGKeyArray], list[PRNGKeyArray]]:
-        """A key by use, and one for each operator of `mating`. Their order depends on `ordered`:
-        there were two programs once, and seeds keep giving the runs that they gave."""
+    def _breed_apart(
+        self, islands: Islands, rows: Rows, each: Each, fresh: Draw, fitness: Fitness, *, key: Key
+    ) -> Bred:
+        """The next generation of each island; the descent has indices of the whole population."""
+        breed_key, fresh_key = jax.random.split(key)
+        k = fitness.shape[0]
+        size = islands.size(k)
+
+        def breed(rows: Rows, fitness: Fitness, *, key: Key) -> Bred:
+            return self._breed(rows, each, fresh, fitness, key=key)
+
+        anew = partial(fresh, size, key=fresh_key)
+        rows, descent = islands(breed, anew, rows, fitness, key=breed_key)
+        return rows, descent.shifted(jnp.arange(k) // size * size)
+
+    def _mated(self, rows: Rows, each: Each, descent: Descent, elites: int, keys) -> Bred:
+        """Every offspring crossed with a random other one, by each operator of `mating`."""
+        n = tree.size(rows)
+        for operator, mate_key in zip(self.mating, keys, strict=True):
+            next_key, cross_key = jax.random.split(mate_key)
+            mate = (jnp.arange(n) + jax.random.randint(next_key, (n,), 1, max(n, 2))) % n
+            mates = tree.take(rows, mate)
+            children = each(operator, rows, mates, key=cross_key)
+            descent = descent.crossed_with(elites + mate, _taken(children, mates, rows))
+            rows = children
+        return rows, descent
+
+    def _fresh(self, draw: Draw, n: int, *, key: Key) -> Bred:
+        """Members that are newly drawn."""
+        return tree.packed(draw(n, key=key))[0], self._unchanged(jnp.full(n, -1), False)
+
+    def _keys(self, key: Key) -> dict[str, Any]:
+        """A key by use; of `mating` one for each operator. Their order depends on `ordered`: there
+        were two programs once, and seeds keep giving the runs that they gave."""
         names, m = "select chance mate cross order mutate extinct fresh", len(self.mating)
         if self.ordered:
             names = "order select mate chance cross mutate extinct fresh"
@@ -163,11 +178,9 @@ class Breeder(eqx.Module):
         else:
             select, crossing, *later = jax.random.split(key, 5 + m)
             keys = [select, *jax.random.split(crossing, 4), *later]
-        return dict(zip(names.split(), keys, strict=False)), keys[8:]
+        return dict(zip([*names.split(), "mating"], [*keys[:8], keys[8:]], strict=True))
 
-    def _crossed(
-        self, parent: Int[Array, " n"], elites: int, *, key: PRNGKeyArray
-    ) -> Bool[Array, " n"]:
+    def _crossed(self, parent: Int[Array, " n"], elites: int, *, key: Key) -> Bool[Array, " n"]:
         """Which offspring have an elite as a second parent."""
         if elites == 0 or isinstance(self.crossover, NoCrossover):
             return jnp.zeros(parent.shape, bool)
@@ -176,18 +189,6 @@ class Breeder(eqx.Module):
 
     def _unchanged(self, parent: Int[Array, " n"], elite: bool) -> Descent:
         return Descent.unchanged(parent, elite, 1 + len(self.mating))
-
-
-def _mated(
-    each: Callable[..., Rows], operator: AbstractCrossover, rows: Rows, *, key: PRNGKeyArray
-) -> tuple[Rows, Int[Array, " n"], Float[Array, " n"]]:
-    """Every member crossed with a random other one, which one that is, and the share from it."""
-    next_key, cross_key = jax.random.split(key)
-    n = tree.size(rows)
-    mate = (jnp.arange(n) + jax.random.randint(next_key, (n,), 1, max(n, 2))) % n
-    mates = tree.take(rows, mate)
-    children = each(operator, rows, mates, key=cross_key)
-    return children, mate, _taken(children, mates, rows)
 
 
 def _taken(children: Rows, mates: Rows, others: Rows) -> Float[Array, " n"]:
@@ -205,15 +206,26 @@ def draw(network: AbstractNetwork, sizes: tuple[int, ...], n: int, *, key: PRNGK
     return eqx.filter_vmap(lambda key: network.init(*sizes, key=key))(keys)
 
 
-def evolving(breeder: Breeder, settings: dict[str, Any]) -> dict[str, Any]:
+def evolving(breeder: Breeder, settings: dict[str, Any], overrides: Any = None) -> dict[str, Any]:
     """An algorithm's settings, of which those that are fields of a breeder are put into one: for
     `mutation=…` a `breeder=…`. Presets take both."""
-    settings = {"breeder": breeder} | settings
-    own = {f.name: settings.pop(f.name) for f in fields(Breeder) if f.name in settings}
-    return settings | {"breeder": replace(settings["breeder"], **own)}
+    settings = overridden(settings, overrides or {})
+    own = {name: value for name, value in settings.items() if name in FIELDS}
+    rest = {name: value for name, value in settings.items() if name not in FIELDS}
+    return rest | {"breeder": replace(rest.get("breeder", breeder), **own)}
+
+
+def overridden(settings: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
+    """A preset's settings and what overrides them: a whole `breeder` all that are fields of one."""
+    if "breeder" in overrides:
+        settings = {name: value for name, value in settings.items() if name not in FIELDS}
+    return settings | overrides
 
 
 def altered(algorithm: Any, **changes: Any) -> Any:
     """An algorithm with other settings, of which those that are fields of its breeder change the
     breeder."""
     return replace(algorithm, **evolving(algorithm.breeder, changes))
+
+
+FIELDS = frozenset(field.name for field in fields(Breeder))

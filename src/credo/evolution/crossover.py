@@ -19,7 +19,7 @@ class AbstractCrossover(eqx.Module):
 
 
 class NoCrossover(AbstractCrossover):
-    """Nobody is crossed: the child is `b`, the offspring that was to have a second parent."""
+    """No crossover: the child is `b`, the offspring that was to have a second parent."""
 
     def __call__(self, a: PyTree, b: PyTree, *, key: PRNGKeyArray) -> PyTree:
         return b
@@ -28,11 +28,12 @@ class NoCrossover(AbstractCrossover):
 class MaskedCrossover(AbstractCrossover):
     """The child is `a` with parts of `b` in it, each with chance `probability`.
 
-    A part is one matrix, one row of a matrix (what one unit receives: the author's choice), or
-    one entry. A vector is a matrix of one column.
+    A row of a matrix is what one unit receives: the author's choice. A vector is a matrix of one
+    column.
     """
 
     part: Literal["matrix", "row", "entry"] = eqx.field(static=True, default="row")
+    """What is taken as a whole: a matrix, a row of one, or a single entry."""
     probability: float = 0.5  # chance that a part is from `b`, in [0, 1]
 
     def __check_init__(self):
@@ -55,12 +56,13 @@ class OnePointCrossover(AbstractCrossover):
     """Of each matrix, with chance `probability`, the child has the rows of `b` from a random one
     on, and those of `a` above (Khadka 2019, Algorithm 5, line 19).
 
-    `taken="row"`: that one row alone, as the text around the box has it: "akin to exchanging a
-    randomly sampled neuron". A vector is a matrix of one column.
+    A vector is a matrix of one column.
     """
 
-    probability: float = 0.05  # of each matrix, in [0, 1]
+    probability: float = 0.05  # chance that a matrix is crossed, in [0, 1]
     taken: Literal["rest", "row"] = eqx.field(static=True, default="rest")
+    """All rows from the random one on (`rest`), or that `row` alone, as the text around the box has
+    it: "akin to exchanging a randomly sampled neuron"."""
 
     def __check_init__(self):
         require.choice("taken", self.taken, ("rest", "row"))

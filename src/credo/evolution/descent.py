@@ -33,3 +33,9 @@ class Descent(eqx.Module):
         """With indices counted from a start that lies `by` members earlier."""
         parent = jnp.where(self.parent < 0, self.parent, self.parent + by)
         return replace(self, parent=parent, mate=self.mate + by[:, None])
+
+    def crossed_with(self, mate: Int[Array, " pop"], taken: Float[Array, " pop"]) -> "Descent":
+        """After one more crossover, from which each member has the share `taken` of its mate."""
+        mates = jnp.concatenate([self.mate, mate[:, None]], axis=1)
+        shares = jnp.concatenate([self.taken, taken[:, None]], axis=1)
+        return replace(self, crossed=self.crossed | (taken > 0.0), mate=mates, taken=shares)

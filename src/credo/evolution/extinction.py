@@ -14,8 +14,8 @@ class Extinction(eqx.Module):
     """With `probability` per generation each member is replaced by a fresh one with chance
     `magnitude` (Khadka 2019, Algorithms 4 and 5)."""
 
-    probability: float = 0.004  # per generation, in [0, 1]
-    magnitude: float = 0.5  # share of the members that dies, in [0, 1]
+    probability: float = 0.004  # chance of an extinction per generation, in [0, 1]
+    magnitude: float = 0.5  # chance that a member then dies, in [0, 1]
 
     def __check_init__(self):
         require.within("probability", self.probability, 0, 1)

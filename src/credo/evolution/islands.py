@@ -5,7 +5,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import PyTree
 
 from .. import require, tree
 from .selection import rankable
@@ -13,7 +13,7 @@ from .selection import rankable
 
 class Islands(eqx.Module):
     """Several lineages in the room of one: members of an island are selected and crossed among
-    themselves, and now and then the island whose best member is the worst is settled anew.
+    themselves, and now and then the island whose best member is the worst is re-initialised.
 
     The island model (Whitley, Rana & Heckendorn 1999) without migration. It is for tasks on which
     a population soon agrees on one solution, and no mutation of that one is better: fresh members
@@ -21,8 +21,9 @@ class Islands(eqx.Module):
     average: it is mostly the newest island that is the weakest. That of the best member stays.
     """
 
-    number: int = eqx.field(static=True, default=4)  # of one size; must divide the population
-    renewal: float = 0.002  # chance per generation that the weakest is settled anew, in [0, 1]
+    number: int = eqx.field(static=True, default=4)  # islands of one size, ≥ 2
+    renewal: float = 0.002
+    """Chance per generation that the weakest island is re-initialised, in [0, 1]."""
 
     def __check_init__(self):
         if not isinstance(self.number, int):
@@ -40,36 +41,28 @@ class Islands(eqx.Module):
         return population // self.number
 
     def __call__(
-        self,
-        breed: Callable[..., PyTree],
-        fresh: Callable[[], PyTree],
-        population: PyTree,
-        fitness: Float[Array, " pop"],
-        *,
-        key: PRNGKeyArray,
+        self, breed: Callable[..., PyTree], fresh: Callable[[], PyTree], population, fitness, *, key
     ) -> PyTree:
         """The next population.
 
         **Arguments:** `breed(island, fitness, key=)` makes the next generation of an island;
-        `fresh` a new island, and is asked when one dies alone (under `vmap`, as in CCEA, always).
+        `fresh()` a new one, and is called only if one dies (under `vmap`, as in CCEA, always).
+        `population` `[pop, ...]`, `fitness` `[pop]`.
         """
         event_key, *keys = jax.random.split(key, 1 + self.number)
         fitness = rankable(fitness).reshape(self.number, -1)
         arrays, rest = eqx.partition(population, eqx.is_array)
         arrays = jax.tree.map(lambda x: x.reshape(*fitness.shape, *x.shape[1:]), arrays)
-
-        def one(arrays, fitness, key):
-            bred = breed(eqx.combine(arrays, rest), fitness, key=key)
-            return eqx.filter(bred, eqx.is_array)
-
-        bred = jax.vmap(one)(arrays, fitness, jnp.stack(keys))
+        bred = eqx.filter_vmap(lambda x, f, key: breed(eqx.combine(x, rest), f, key=key))(
+            arrays, fitness, jnp.stack(keys)
+        )
         best = jnp.max(fitness, axis=1)
         weakest = jnp.argmin(best.at[jnp.argmax(best)].set(jnp.inf))
+        bred, rest = eqx.partition(bred, eqx.is_array)
 
         def renewed():
             return tree.put(bred, weakest, eqx.filter(fresh(), eqx.is_array))
 
         event = jax.random.bernoulli(event_key, jnp.float32(self.renewal))
         bred = jax.lax.cond(event, renewed, lambda: bred)
-        bred = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), bred)
-        return eqx.combine(bred, rest)
+        return eqx.combine(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), bred), rest)

@@ -10,6 +10,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .. import require, tree
 
+Key = PRNGKeyArray
+Weights = Float[Array, " entries"]  # of a genome, see `tree.ravel`
+Hits = Bool[Array, " entries"]
 FRACTION = 0.1  # the share of a matrix that is hit unless said
 
 
@@ -31,22 +34,23 @@ class MatrixMutation(AbstractMutation):
     would erase the weight; noise proportional to the weight is added, as the author's code does.
     """
 
-    probability: float = 0.9  # chance of the gate, in [0, 1]
+    probability: float = 0.9  # chance that a matrix or genome is mutated, in [0, 1]
     gate: Literal["matrix", "genome"] = eqx.field(static=True, default="matrix")
+    """Whether that chance decides for each matrix or for a whole genome."""
     fraction: float = FRACTION  # share of a matrix's entries that is hit, in [0, 1]
     up_to_fraction: bool = eqx.field(static=True, default=False)
     """Draw the share anew for each matrix, uniformly up to `fraction` and at least one entry."""
     one_in: int | None = eqx.field(static=True, default=None)
-    """Instead of `fraction`: of so many entries in a row one is hit, drawn at random. As many hits,
-    for a fraction of the random numbers; for genomes of very many weights."""
-    vectors: bool = eqx.field(static=True, default=True)  # hit biases and start memory too
-    strength: float = 0.1  # std of the noise, relative to the weight
-    floor: float = 0.0  # std of further noise, absolute, so that small weights can move
+    """Instead of `fraction`: of so many entries in a row one is hit, drawn at random, ≥ 1; faster
+    for genomes of very many weights. None: `fraction` of all."""
+    vectors: bool = eqx.field(static=True, default=True)  # mutate biases and start memory too
+    strength: float = 0.1  # std of the noise, relative to the weight, ≥ 0
+    floor: float = 0.0  # std of further noise, absolute, ≥ 0, so that small weights can move
     super_probability: float = 0.0  # share of hits that are super, in [0, 1]
-    super_strength: float = 10.0  # std of the super noise, relative to the weight
+    super_strength: float = 10.0  # std of the super noise, relative to the weight, ≥ 0
     reset_probability: float = 0.0  # share of hits that are resets, in [0, 1]
-    reset_std: float = 1.0  # std of a reset weight; 0 erases it
-    limit: float = 1e6  # largest magnitude of a weight
+    reset_std: float = 1.0  # std of a reset weight, ≥ 0; 0 erases it
+    limit: float = 1e6  # weights are clipped to plus and minus this, ≥ 0
 
     def __check_init__(self):
         for name in ("probability", "fraction", "super_probability", "reset_probability"):
@@ -76,13 +80,7 @@ class MatrixMutation(AbstractMutation):
         hit = gate & self.hits(layout, key=hit_key)
         return unravel(jnp.where(hit, self.moved(w, key=move_key), w))
 
-    def one_of_each(
-        self,
-        w: Float[Array, " entries"],
-        gate: Bool[Array, "..."],
-        hit_key: PRNGKeyArray,
-        move_key: PRNGKeyArray,
-    ) -> Float[Array, " entries"]:
+    def one_of_each(self, w: Weights, gate: Hits, hit_key: Key, move_key: Key) -> Weights:
         """The weights when of every `one_in` in a row one is hit, where its gate is open."""
         size, width = w.shape[0], self.one_in or 1
         first = jnp.arange(0, size, width)
@@ -94,19 +92,13 @@ class MatrixMutation(AbstractMutation):
         # Of a last row that is shorter perhaps none is hit: each entry has the same chance.
         return w.at[index].set(new, mode="drop", unique_indices=True)
 
-    def hits(self, layout: tree.Layout, *, key: PRNGKeyArray) -> Bool[Array, " entries"]:
+    def hits(self, layout: tree.Layout, *, key: Key) -> Hits:
         """Which entries a mutation hits in the matrices whose gate is open."""
         entry_key, *share_keys = jax.random.split(key, 3)
         u = jax.random.uniform(entry_key, layout.leaf.shape)
         return self.up_to(u, layout, *share_keys) if self.up_to_fraction else u < self.fraction
 
-    def up_to(
-        self,
-        u: Float[Array, " entries"],
-        layout: tree.Layout,
-        count_key: PRNGKeyArray,
-        sure_key: PRNGKeyArray,
-    ) -> Bool[Array, " entries"]:
+    def up_to(self, u: Weights, layout: tree.Layout, count_key: Key, sure_key: Key) -> Hits:
         """Of each matrix a share drawn anew, at least one entry."""
         sizes = jnp.asarray(layout.sizes, jnp.float32)
         most = jnp.ceil(self.fraction * sizes)
@@ -119,7 +111,7 @@ class MatrixMutation(AbstractMutation):
         hit = (u < others[layout.leaf]) | (layout.place == sure[layout.leaf])
         return hit & (most > 0.0)[layout.leaf]
 
-    def moved(self, w: Float[Array, " n"], *, key: PRNGKeyArray) -> Float[Array, " n"]:
+    def moved(self, w: Weights, *, key: Key) -> Weights:
         """Every weight as it is after a hit."""
         kind_key, noise_key, extra_key = jax.random.split(key, 3)
         kind = jax.random.uniform(kind_key, w.shape)
@@ -136,7 +128,7 @@ class MatrixMutation(AbstractMutation):
 class GaussianMutation(AbstractMutation):
     """Add N(0, std) to every weight: the plain mutation of evolution strategies."""
 
-    std: float = 0.1
+    std: float = 0.1  # of the noise on every weight, absolute
 
     def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
         w, unravel, _ = tree.ravel(genome)
@@ -146,7 +138,7 @@ class GaussianMutation(AbstractMutation):
 class Mutations(AbstractMutation):
     """Several, one behind the other."""
 
-    each: tuple[AbstractMutation, ...]
+    each: tuple[AbstractMutation, ...]  # applied in this order
 
     def __call__(self, genome: PyTree, *, key: PRNGKeyArray) -> PyTree:
         for mutation, mutation_key in zip(

@@ -23,7 +23,7 @@ def ranking(fitness: Float[Array, " pop"]) -> Int[Array, " pop"]:
 
 
 class AbstractSelection(eqx.Module):
-    sees_fitness: ClassVar[bool] = True  # False: nobody is better, and elites are drawn too
+    sees_fitness: ClassVar[bool] = True  # False: elites are drawn at random too
 
     @abc.abstractmethod
     def __call__(
@@ -35,7 +35,7 @@ class AbstractSelection(eqx.Module):
 class Tournament(AbstractSelection):
     """The best of `size` members drawn with replacement, `n` times."""
 
-    size: int = eqx.field(static=True, default=3)  # entrants per tournament, at least 1
+    size: int = eqx.field(static=True, default=3)  # members per tournament, ≥ 1
 
     def __check_init__(self):
         require.at_least("size", self.size, 1)
@@ -50,7 +50,7 @@ class Tournament(AbstractSelection):
 class Truncation(AbstractSelection):
     """Uniformly one of the best `fraction` of the population, `n` times."""
 
-    fraction: float = eqx.field(static=True, default=0.2)  # share that may breed, in (0, 1]
+    fraction: float = eqx.field(static=True, default=0.2)  # best share, in (0, 1]
 
     def __check_init__(self):
         if not 0.0 < self.fraction <= 1.0:

@@ -18,9 +18,11 @@ from ..normalization import Moments, seen
 from ..replay import Replay
 from ..types import NOTHING, Batch, Metrics
 
+Learned = tuple[PyTree, Metrics]  # state and metrics
+
 
 class AbstractLearner(eqx.Module):
-    """Learns a policy, the *actor*, from minibatches of anybody's experience.
+    """Learns a policy, the *actor*, from minibatches of experience, whoever collected it.
 
     Hyper-parameters that fix no shape are data: learners that differ in γ are one program.
     """
@@ -57,9 +59,7 @@ class AbstractLearner(eqx.Module):
         """`state` that goes on from a given actor."""
 
 
-def learn(
-    learner: AbstractLearner, state: PyTree, replay: Replay, updates: Int[Array, ""], **rest: Any
-) -> tuple[PyTree, Metrics]:
+def learn(learner: AbstractLearner, state, replay: Replay, updates, **rest) -> Learned:
     """`updates` gradient steps, each on a minibatch of its own, in one program. Their number is
     data.
 
@@ -140,7 +140,7 @@ def features_first(x: Float[Array, "batch *agents size"]) -> Float[Array, "size 
 
 
 def mean(x: Float[Array, "*batch"], active: Bool[Array, "*batch"] | None) -> Float[Array, ""]:
-    """The mean over those who acted; 0 if nobody did."""
+    """The mean over the agents that acted; 0 if none did."""
     return jnp.mean(x) if active is None else _mean_where(x, active)
 
 
@@ -148,10 +148,8 @@ def _mean_where(x: Array, active: Array) -> Array:
     return jnp.sum(x, where=active) / jnp.maximum(jnp.sum(active.astype(x.dtype)), 1.0)
 
 
-def act(
-    policy: AbstractPolicy, obs: Float[Array, "batch *agents obs"]
-) -> Float[Array, "batch *agents act"]:
-    """Actions of a memoryless policy, for a batch."""
+def act(policy: AbstractPolicy, obs: Float[Array, "batch *agents obs"]) -> Array:
+    """Actions `[batch, *agents, act]` of a memoryless policy, for a batch."""
     if policy.features_first:  # one matrix product per layer
         return policy(obs.T, policy.start(key=None))[0].T  # pyright: ignore[reportArgumentType]
     start = policy.start(key=jax.random.key(0))

@@ -43,25 +43,28 @@ class AbstractManager(eqx.Module):
             raise ValueError(f"memory is {self.memory}: it must lie in (0, 1]")
 
     @jit
-    def observe(
-        self, ledger: Ledger, i: int, returns: Float[Array, " n"], played: Bool[Array, " n"]
-    ) -> Ledger:
+    def observe(self, ledger: Ledger, i: int, returns: Array, played: Array) -> Ledger:
         """With learner `i`'s new returns, one after the other: v ← α·return + (1-α)·v. The first
-        return of all is v; as printed v would start at 0 and be wrong for long."""
+        return of all is v; as printed v would start at 0 and be wrong for long.
+
+        **Arguments:** `returns` `[n]`, of which those count that were `played`.
+        """
 
         def one(ledger, new):
             value, counts = new
             # A learner that returned NaN has had its turn, but no value that could be compared.
-            good = counts & jnp.isfinite(value)
+            good = jnp.isfinite(value)
             value = jnp.where(good, value, 0.0)
             α = jnp.where(ledger.known[i], self.memory, 1.0)
-
-            def blended(new, old):
-                return old.at[i].set(jnp.where(good, α * new + (1.0 - α) * old[i], old[i]))
-
-            means = blended(value, ledger.value), blended(value**2, ledger.square)
-            count = ledger.count.at[i].add(counts.astype(jnp.int32))
-            return Ledger(*means, count, ledger.known.at[i].max(good)), None
+            mean = α * value + (1.0 - α) * ledger.value[i]
+            square = α * value**2 + (1.0 - α) * ledger.square[i]
+            after = Ledger(
+                jnp.where(good, ledger.value.at[i].set(mean), ledger.value),
+                jnp.where(good, ledger.square.at[i].set(square), ledger.square),
+                ledger.count.at[i].add(1),
+                ledger.known.at[i].set(ledger.known[i] | good),
+            )
+            return jax.tree.map(lambda a, b: jnp.where(counts, a, b), after, ledger), None
 
         return jax.lax.scan(one, ledger, (returns, played))[0]
 
@@ -73,8 +76,8 @@ class AbstractManager(eqx.Module):
 class UCB(AbstractManager):
     """Upper confidence bounds (equation 6.1), normalised to chances that workers are drawn from."""
 
-    exploration: float = 0.9  # c
-    memory: float = 0.2  # α; the text gives none, this is the author's
+    exploration: float = 0.9  # c: weight of the bonus for learners that played little, ≥ 0
+    memory: float = 0.2  # α: weight of the newest return, in (0, 1]; the author's
 
     def __check_init__(self):
         require.at_least("exploration", self.exploration, 0)
@@ -99,7 +102,7 @@ class UCB(AbstractManager):
 class Uniform(AbstractManager):
     """The same chance for every learner: what a manager is measured against."""
 
-    memory: float = 0.2  # α, for the record alone
+    memory: float = 0.2  # α: weight of the newest return, in (0, 1]; for metrics alone
 
     def allocate(self, ledger, workers, *, key):
         return jax.random.randint(key, (workers,), 0, ledger.value.shape[0])
@@ -109,7 +112,7 @@ class Thompson(AbstractManager):
     """Each worker goes to the learner with the highest return imagined: a draw from the normal
     distribution of its mean (Thompson 1933)."""
 
-    memory: float = 0.2  # α
+    memory: float = 0.2  # α: weight of the newest return, in (0, 1]
 
     def allocate(self, ledger, workers, *, key):
         variance = jnp.maximum(ledger.square - ledger.value**2, 0.0)

@@ -27,6 +27,10 @@ from ..networks.mlp import (
 from ..types import Batch, Metrics
 from .base import AbstractLearner, adam, adam_state, descend, polyak
 
+Key = PRNGKeyArray
+Scalar = Float[Array, ""]
+Values = Float[Array, " batch"]
+Critics = tuple[AbstractCriticNetwork, ...]
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # of the authors' code
 
 
@@ -69,9 +73,11 @@ class Sampler(AbstractPolicy):
 
 
 class SACState(eqx.Module):
+    """Networks, the critics' targets, the temperature, and the states of Adam."""
+
     actor: StochasticActor
-    critics: tuple[AbstractCriticNetwork, ...]
-    target_critics: tuple[AbstractCriticNetwork, ...]
+    critics: Critics
+    target_critics: Critics
     log_alpha: Float[Array, ""]
     actor_opt: optax.OptState
     critic_opt: optax.OptState
@@ -83,17 +89,18 @@ class SAC(AbstractLearner):
 
     metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "actor_loss", "alpha")
 
-    critic: AbstractCritic = Critic()
-    gamma: float = 0.99  # discount per step, in [0, 1]
-    actor_lr: float = 3e-4  # of Adam
-    critic_lr: float = 3e-4
-    alpha_lr: float = 3e-4
-    tau: float = 5e-3  # share of the new weights in the targets
-    target_entropy: float = -1.0  # nats per action dimension
-    reward_scale: float = 1.0  # critics see rewards times this
-    critics: int = eqx.field(static=True, default=2)  # the least of them is believed
-    batch_size: int = eqx.field(static=True, default=256)
+    critic: AbstractCritic = Critic()  # network of the action values
+    gamma: float = 0.99  # γ: discount per step, in [0, 1]
+    actor_lr: float = 3e-4  # learning rate of the actor's Adam, ≥ 0
+    critic_lr: float = 3e-4  # learning rate of the critics' Adam, ≥ 0
+    alpha_lr: float = 3e-4  # learning rate of the temperature's Adam, ≥ 0
+    tau: float = 5e-3  # share of the new weights in the target networks per update, in [0, 1]
+    target_entropy: float = -1.0  # of the policy, in nats per action dimension
+    reward_scale: float = 1.0  # factor of all rewards that critics see, ≥ 0
+    critics: int = eqx.field(static=True, default=2)  # the target is their minimum, ≥ 1
+    batch_size: int = eqx.field(static=True, default=256)  # transitions per update, ≥ 1
     signal: str | None = eqx.field(static=True, default=None)
+    """Name of the reward that it maximises; None: that of its algorithm."""
 
     def __check_init__(self):
         require.within("gamma", self.gamma, 0, 1)
@@ -120,9 +127,7 @@ class SAC(AbstractLearner):
         opts = (adam_state(actor), adam_state(critics), adam_state(log_alpha))
         return SACState(actor, critics, critics, log_alpha, *opts)
 
-    def update(
-        self, state: SACState, batch: Batch, *, key: PRNGKeyArray
-    ) -> tuple[SACState, Metrics]:
+    def update(self, state: SACState, batch: Batch, *, key: Key) -> tuple[SACState, Metrics]:
         target_key, actor_key = jax.random.split(key)
         alpha = jnp.exp(state.log_alpha)
 
@@ -143,9 +148,7 @@ class SAC(AbstractLearner):
         state = SACState(actor, critics, targets, log_alpha, actor_opt, critic_opt, alpha_opt)
         return state, {"critic_loss": critic_loss, "actor_loss": actor_loss, "alpha": alpha}
 
-    def soft_target(
-        self, state: SACState, batch: Batch, alpha: Float[Array, ""], *, key: PRNGKeyArray
-    ) -> Float[Array, " batch"]:
+    def soft_target(self, state: SACState, batch: Batch, alpha: Scalar, *, key: Key) -> Values:
         """y = r + γ (min_i Q'_i(s', a') - α log π(a'|s')), a' drawn from the policy."""
         obs = batch.next_obs.T
         action, log_p = state.actor.sample(obs, key=key)
@@ -163,22 +166,19 @@ class SAC(AbstractLearner):
         return eqx.tree_at(lambda s: s.actor.mean, state, actor)
 
 
-def soft_critic_error(
-    critics: tuple[AbstractCriticNetwork, ...], batch: Batch, target: Float[Array, " batch"]
-) -> tuple[Float[Array, ""], None]:
+def soft_critic_error(critics: Critics, batch: Batch, target: Values) -> tuple[Scalar, None]:
     """Half the sum over critics of the mean squared Bellman error."""
     qs = jnp.stack([critic(batch.obs.T, batch.action.T) for critic in critics])
     return 0.5 * jnp.sum(jnp.mean(jnp.square(qs - target[None]), axis=1)), None
 
 
 def soft_actor_loss(
-    actor: StochasticActor,
-    critics: tuple[AbstractCriticNetwork, ...],
-    batch: Batch,
-    alpha: Float[Array, ""],
-    key: PRNGKeyArray,
-) -> tuple[Float[Array, ""], Float[Array, " batch"]]:
-    """E[α log π(a|s) - min_i Q_i(s, a)] and log π, a drawn from the policy."""
+    actor: StochasticActor, critics: Critics, batch: Batch, alpha: Scalar, key: Key
+) -> tuple[Scalar, Values]:
+    """E[α log π(a|s) - min_i Q_i(s, a)] and log π(a|s), with actions a drawn from the policy.
+
+    SAC minimises the first, and needs the second for the temperature.
+    """
     action, log_p = actor.sample(batch.obs.T, key=key)
     q = jnp.min(jnp.stack([critic(batch.obs.T, action) for critic in critics]), axis=0)
     return jnp.mean(alpha * log_p - q), log_p

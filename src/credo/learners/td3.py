@@ -48,11 +48,18 @@ ERL_NETWORK = MLP(hidden=(128, 128), normalization="before", initializer="unifor
 """The actor of ERL (Khadka 2019, section 5.4)."""
 
 
+Key = PRNGKeyArray
+Critics = tuple[AbstractCriticNetwork, ...]
+Values = Float[Array, "batch *agents"]
+
+
 class TD3State(eqx.Module):
+    """Networks, their targets, and the states of Adam."""
+
     actor: AbstractPolicy
-    critics: tuple[AbstractCriticNetwork, ...]
+    critics: Critics
     target_actor: AbstractPolicy
-    target_critics: tuple[AbstractCriticNetwork, ...]
+    target_critics: Critics
     actor_opt: optax.OptState
     critic_opt: optax.OptState
     step: Int[Array, ""]
@@ -65,24 +72,25 @@ class TD3(AbstractLearner):
     metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "q")
     teams: ClassVar[bool] = True
 
-    critic: AbstractCritic = Critic()
-    gamma: float = 0.99  # discount per step, in [0, 1]
-    actor_lr: float = 3e-4  # of Adam
-    critic_lr: float = 3e-4
-    tau: float = 5e-3  # share of the new weights in the targets
-    target_noise: float = 0.2  # std of the smoothing noise, in units of actions
-    target_noise_clip: float = 0.5
-    noise: AbstractNoise = GaussianNoise()  # exploration
-    critics: int = eqx.field(static=True, default=2)  # the least of them is believed
-    policy_delay: int = eqx.field(static=True, default=2)  # critic steps per step of the actor
-    actor_max_norm: float | None = None  # the actor's gradient is clipped to this norm
-    critic_max_norm: float | None = None  # the critics' too
-    actor_scale: float = 1.0  # of the fresh actor's output layer
+    critic: AbstractCritic = Critic()  # network of the action values
+    gamma: float = 0.99  # γ: discount per step, in [0, 1]
+    actor_lr: float = 3e-4  # learning rate of the actor's Adam, ≥ 0
+    critic_lr: float = 3e-4  # learning rate of the critics' Adam, ≥ 0
+    tau: float = 5e-3  # share of the new weights in the target networks per update, in [0, 1]
+    target_noise: float = 0.2  # std of the noise on target actions, ≥ 0, in units of actions
+    target_noise_clip: float = 0.5  # that noise is clipped to plus and minus this, ≥ 0
+    noise: AbstractNoise = GaussianNoise()  # of exploration
+    critics: int = eqx.field(static=True, default=2)  # the target is their minimum, ≥ 1
+    policy_delay: int = eqx.field(static=True, default=2)  # critic updates per actor update, ≥ 1
+    actor_max_norm: float | None = None  # norm to which its gradient is clipped; None: not
+    critic_max_norm: float | None = None  # norm to which theirs is clipped; None: not
+    actor_scale: float = 1.0  # factor of the weights in the fresh actor's output layer
     bootstrap_truncated: bool = eqx.field(static=True, default=True)
     """A time limit is not the end of the task; False: it counts as one, as in the author's code."""
-    reward_scale: float = 1.0  # critics see rewards times this: values of thousands come slowly
-    batch_size: int = eqx.field(static=True, default=256)
+    reward_scale: float = 1.0  # factor of all rewards that critics see, ≥ 0
+    batch_size: int = eqx.field(static=True, default=256)  # transitions per update, ≥ 1
     signal: str | None = eqx.field(static=True, default=None)
+    """Name of the reward that it maximises; None: that of its algorithm."""
 
     def __check_init__(self):
         require.within("gamma", self.gamma, 0, 1)
@@ -98,22 +106,19 @@ class TD3(AbstractLearner):
     def together(self) -> bool:
         return self.critic.joint
 
-    def init(self, network: AbstractNetwork, *sizes: int, key: PRNGKeyArray) -> TD3State:
+    def init(self, network: AbstractNetwork, *sizes: int, key: Key) -> TD3State:
         actor_key, critic_key = jax.random.split(key)
         actor = network.init(*sizes, key=actor_key)
         require_memoryless(network, actor)
         if isinstance(actor, MLPPolicy | TeamPolicy):
             actor = actor.scaled(self.actor_scale)
-        critics = tuple(
-            self.critic.init(*(sizes if self.together else sizes[:2]), key=key)
-            for key in jax.random.split(critic_key, self.critics)
-        )
+        seen = sizes if self.together else sizes[:2]
+        keys = jax.random.split(critic_key, self.critics)
+        critics = tuple(self.critic.init(*seen, key=key) for key in keys)
         opts = (adam_state(actor), adam_state(critics))
         return TD3State(actor, critics, actor, critics, *opts, jnp.int32(0), sizes[2:])
 
-    def update(
-        self, state: TD3State, batch: Batch, *, key: PRNGKeyArray
-    ) -> tuple[TD3State, Metrics]:
+    def update(self, state: TD3State, batch: Batch, *, key: Key) -> tuple[TD3State, Metrics]:
         given = (state.critics, batch, self.bellman_target(state, batch, key=key))
         rate = (self.critic_lr, self.critic_max_norm)
         critics, critic_opt, (loss, q) = descend(critic_error, given, state.critic_opt, *rate)
@@ -132,9 +137,7 @@ class TD3(AbstractLearner):
         state = replace(state, critics=critics, critic_opt=critic_opt, **after)
         return state, {"critic_loss": loss, "q": q}
 
-    def bellman_target(
-        self, state: TD3State, batch: Batch, *, key: PRNGKeyArray
-    ) -> Float[Array, "batch *agents"]:
+    def bellman_target(self, state: TD3State, batch: Batch, *, key: Key) -> Values:
         """y = r + γ min_i Q'_i(s', π'(s') + clipped noise)."""
         noise = self.target_noise * jax.random.normal(key, batch.action.shape)
         noise = jnp.clip(noise, -self.target_noise_clip, self.target_noise_clip)
@@ -157,29 +160,16 @@ class TD3(AbstractLearner):
         return eqx.tree_at(lambda s: (s.actor, s.target_actor), state, (actor, actor))
 
 
-def ddpg(**fields) -> TD3:
+def ddpg(**fields: Any) -> TD3:
     """DDPG as settings of `TD3`, with the constants of ERL (Khadka 2019, section 5.4)."""
-    settings = {
-        "critics": 1,
-        "policy_delay": 1,
-        "target_noise": 0.0,
-        "noise": OrnsteinUhlenbeck(),
-        "critic": Critic(
-            hidden=(300,),
-            branches=(200, 200),
-            activation="elu",
-            normalization="before",
-            output_scale=0.1,
-        ),
-        "actor_lr": 5e-5,
-        "critic_lr": 5e-4,
-        "tau": 1e-3,
-        "actor_max_norm": 10.0,
-        "critic_max_norm": 10.0,
-        "actor_scale": 0.1,
-        "batch_size": 128,
-    }
-    return TD3(**(settings | fields))
+    layers: dict[str, Any] = {"hidden": (300,), "branches": (200, 200), "output_scale": 0.1}
+    critic = Critic(activation="elu", normalization="before", **layers)
+    settings: dict[str, Any] = {"critic": critic, "noise": OrnsteinUhlenbeck()}
+    settings |= {"critics": 1, "policy_delay": 1, "target_noise": 0.0}
+    settings |= {"actor_lr": 5e-5, "critic_lr": 5e-4, "tau": 1e-3}
+    settings |= {"actor_max_norm": 10.0, "critic_max_norm": 10.0, "actor_scale": 0.1}
+    settings |= {"batch_size": 128} | fields
+    return TD3(**settings)
 
 
 def matd3(**fields: Any) -> TD3:
@@ -193,9 +183,7 @@ def maddpg(**fields: Any) -> TD3:
     return matd3(**({"critics": 1, "policy_delay": 1, "target_noise": 0.0} | fields))
 
 
-def critic_error(
-    critics: tuple[AbstractCriticNetwork, ...], batch: Batch, target: Float[Array, "batch *agents"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def critic_error(critics: Critics, batch: Batch, target: Values) -> tuple[Array, Array]:
     """Sum over critics of the mean squared Bellman error, and their mean value."""
     pair = (features_first(batch.obs), features_first(batch.action))
     qs = [critic(*pair) for critic in critics]
@@ -204,9 +192,7 @@ def critic_error(
     return jnp.sum(jnp.stack(errors)), jnp.mean(jnp.stack(values))
 
 
-def actor_loss(
-    actor: AbstractPolicy, critic: AbstractCriticNetwork, batch: Batch
-) -> tuple[Float[Array, ""], None]:
+def actor_loss(actor: AbstractPolicy, critic: AbstractCriticNetwork, batch: Batch):
     """Minus the value of what the actor would do (deterministic policy gradient)."""
     actions = (act(actor, batch.obs), batch.action)
     q = critic.own(features_first(batch.obs), *map(features_first, actions))
