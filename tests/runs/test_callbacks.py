@@ -248,7 +248,7 @@ def test_events_that_fail_later_are_dropped_with_one_warning(tmp_path):
 @pytest.mark.parametrize("name", ["wandb", "trackio"])
 def test_a_logger_that_is_not_installed_says_how_to_get_it(tmp_path, monkeypatch, name):
     monkeypatch.setattr(callbacks.importlib.util, "find_spec", lambda _: None)
-    told = rf"{name} is not installed: pip install \"credo\[{name}\]\""
+    told = rf"{name} is not installed: pip install '.\[{name}\]'"
     with pytest.raises(RunError, match=told):
         train(ALGORITHM, path=tmp_path / "run", loggers=(name,))
     assert not (tmp_path / "run").exists()

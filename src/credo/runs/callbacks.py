@@ -135,7 +135,7 @@ def of(options: "RunOptions") -> list[Callback]:
     heard: list[Callback] = [TensorBoard()] * options.tensorboard
     for name in options.loggers:
         if importlib.util.find_spec(name) is None:
-            raise RunError(f'{name} is not installed: pip install "credo[{name}]"')
+            raise RunError(f"{name} is not installed: pip install '.[{name}]' in a checkout")
         heard.append(LOGGERS[name]())
     for callback in options.callbacks:
         if not isinstance(callback, Callback) and not callable(callback):

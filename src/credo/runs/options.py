@@ -2,11 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any, Literal
 
 from .. import require
-from .callbacks import Callback
 
 LARGEST = 2**63 - 1
 
@@ -50,7 +48,7 @@ class RunOptions:
     progress: bool = True
     """Whether to show a progress bar, or a line every ten seconds where there is no terminal."""
 
-    callbacks: tuple[Callback | Callable[..., Any], ...] = ()
+    callbacks: tuple[Any, ...] = ()
     """Objects that hear of every generation, test and end (see `credo.Callback`); a plain function
     `f(run, generation, metrics)` stands for `on_generation`. From Python alone: they are neither
     recorded nor sent to the processes of several runs."""
