@@ -22,7 +22,7 @@ class Cauchy(credo.AbstractMutation):
 if __name__ == "__main__":
     task, network = credo.SequenceClassification(depth=3), credo.MMU(hidden=5)
     for name, mutation in {"library": credo.MatrixMutation(), "Cauchy": Cauchy()}.items():
-        algorithm = credo.Neuroevolution(task, network, mutation=mutation)
+        algorithm = credo.Neuroevolution.as_written(task, network, mutation=mutation)
         run = credo.train(algorithm, generations=100, path=f"runs/own-mutation-{name.lower()}")
         print(name, "mean score of the last 20 champions:",
               run.metrics["champion_score"][-20:].mean())  # fmt: skip

@@ -295,7 +295,7 @@ def test_a_command_without_its_argument_shows_its_usage(credo, command):
 def test_every_flag_is_listed_with_its_meaning_and_default(credo):
     code, out, _ = credo("train neuroevolution sequence-classification --help")
     assert code == 0
-    for flag in ("--depth", "--network.hidden", "--mutation.strength", "--generations"):
+    for flag in ("--depth", "--network.hidden", "--breeder.mutation.strength", "--generations"):
         assert flag in out
     assert "signals per sequence" in out
     assert "21" in out
@@ -317,14 +317,15 @@ def test_a_preset_can_be_overridden_by_flags():
     from credo.environments.sequence_classification import SequenceClassification
     from credo.networks.mmu import MMU
 
-    argv = ["--depth", "5", "--episodes", "7", "--mutation.strength", "0.3", "--seed", "4"]
+    argv = ["--depth", "5", "--episodes", "7", "--breeder.mutation.strength", "0.3", "--seed", "4"]
     algorithm, options = cli._configured(
         "credo train", Neuroevolution.ours, SequenceClassification(), MMU(), argv
     )
     expected = Neuroevolution.ours(SequenceClassification(depth=5), MMU(), episodes=7)
-    mutation = dataclasses.replace(expected.mutation, strength=0.3)
+    mutation = dataclasses.replace(expected.breeder.mutation, strength=0.3)
+    breeder = dataclasses.replace(expected.breeder, mutation=mutation)
     assert type(algorithm) is Neuroevolution
-    assert algorithm == dataclasses.replace(expected, mutation=mutation)
+    assert algorithm == dataclasses.replace(expected, breeder=breeder)
     assert options.seed == 4
 
 
@@ -467,15 +468,15 @@ def test_what_resume_is_told_reaches_the_loop(credo, seeds, run, monkeypatch):
     told = []
     resumed = lambda path, **fields: told.append((path, fields)) or Run(path)  # noqa: E731
     monkeypatch.setattr("credo.runs.loop.resume", resumed)
-    words = "--set mutation.strength=0.5 --set episodes=5 --trust --without-replay"
+    words = "--set breeder.mutation.strength=0.5 --set episodes=5 --trust --without-replay"
     assert credo(f"resume {run} {words} --wall-clock 2m")[0] == 0
     assert credo(f"resume {seeds} {words}")[0] == 0
     assert [path for path, _ in told] == [run, *sorted(pathlib.Path(seeds).glob("*"), reverse=True)]
     for _, fields in told:
-        assert fields["set"] == {"mutation.strength": 0.5, "episodes": 5}
+        assert fields["set"] == {"breeder.mutation.strength": 0.5, "episodes": 5}
         assert (fields["trust"], fields["without_replay"]) == (True, True)
     assert told[0][1]["wall_clock"] == 120.0
-    code, _, err = credo(f"resume {run} --set mutation.strngth=0.5")
+    code, _, err = credo(f"resume {run} --set breeder.mutation.strngth=0.5")
     assert code == 2
     assert "did you mean 'strength'?" in err
 
@@ -659,7 +660,7 @@ def test_a_function_makes_a_task_with_the_settings_it_is_given(credo, own_tasks,
     code, _, err = credo(f"check {task} --in-process True --kwargs h=5")
     assert code == 2
     assert f"cannot use {task}: it raised TypeError: swing() got an unexpected" in err
-    flags = "--population-size 3 --elite-fraction 0.4 --network.hidden 4 --generations 1"
+    flags = "--population-size 3 --breeder.elite-fraction 0.4 --network.hidden 4 --generations 1"
     words = f"train ea {task} --kwargs g=5.0 --in-process True {flags} --test-episodes 1"
     assert credo(f"{words} --path {tmp_path / 'run'}")[0] == 0
     env = Run(tmp_path / "run").algorithm.env
@@ -746,7 +747,7 @@ def test_a_task_is_checked_with_the_flags_it_is_given(credo, own_tasks):
 
 
 def test_a_champion_of_another_network_is_refused_with_both(credo, tmp_path):
-    words = "train ea Pendulum-v1 --generations 1 --population-size 3 --elite-fraction 0.4"
+    words = "train ea Pendulum-v1 --generations 1 --population-size 3 --breeder.elite-fraction 0.4"
     assert credo(*words.split(), "--network.hidden", "4", "--path", str(tmp_path / "a"))[0] == 0
     code, _, err = credo(
         *words.split(), "--from", str(tmp_path / "a"), "--path", str(tmp_path / "b")
@@ -761,7 +762,7 @@ def test_a_champion_of_another_network_is_refused_with_both(credo, tmp_path):
 
 MERL = (
     "--rovers 3 --coupling 2 --pois 2 --max-steps 4 --size 8 --network.trunk 4 "
-    "--population-size 4 --elite-fraction 0.25 --episodes 2 --workers 2 --test-episodes 2 "
+    "--population-size 4 --breeder.elite-fraction 0.25 --episodes 2 --workers 2 --test-episodes 2 "
     "--warmup-frames 30 --replay-capacity 100 --migration-period 3 --fitness global "
     "--updates-per-frame 0.1 --tensorboard False"
 )
@@ -828,7 +829,8 @@ def test_a_team_of_ones_own_is_given_its_time_limit(credo, tmp_path, monkeypatch
     monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parent / "environments"))
     path = tmp_path / "run"
     flags = (
-        "--population-size 5 --elite-fraction 0.2 --episodes 1 --workers 1 --network.trunk 4 "
+        "--population-size 5 --breeder.elite-fraction 0.2 --episodes 1 --workers 1 "
+        "--network.trunk 4 "
         "--learners.0.batch-size 4 --warmup-frames 1000 --replay-capacity 50 --tensorboard False"
     )
     words = f"train merl broken_team:Pair --max-episode-steps=4 {flags} --generations 1"

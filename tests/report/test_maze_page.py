@@ -30,7 +30,7 @@ def champion(env=ENV):
 def made(path, env=ENV) -> Run:
     """A run on disk whose champion has fresh weights."""
     path.mkdir()
-    algorithm = CCEA(env, NETWORK, population_size=10, elite_fraction=0.1)
+    algorithm = CCEA.ccea(env, NETWORK, population_size=10, elite_fraction=0.1)
     checkpoint.export_policy(path / "champion.safetensors", champion(env))
     config.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
     return Run(path)

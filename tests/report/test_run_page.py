@@ -80,7 +80,8 @@ def test_seeds_are_one_curve_and_settings_are_two(page_of, tmp_path):
 def test_groups_that_the_first_fields_cannot_tell_apart_stay_apart(page_of, tmp_path):
     def variant(depth, size, elites, episodes):
         task = SequenceClassification(depth, 1, 2)
-        return Neuroevolution(task, MMU(hidden=3), size, elites, episodes, test_episodes=6)
+        given = {"population_size": size, "elite_fraction": elites, "episodes": episodes}
+        return Neuroevolution.as_written(task, MMU(hidden=3), **given, test_episodes=6)
 
     settings = [(2, 10, 0.1, 4), (2, 10, 0.1, 5), (3, 20, 0.2, 6)]
     page = page_of(

@@ -12,6 +12,7 @@ from credo.runs import config, record, trust
 from credo.runs.loop import Run, RunError, runs_in
 
 TREE = json.loads(json.dumps(config.to_tree(Neuroevolution(Copy(), MMU(hidden=2)))))
+BREEDER = TREE["breeder"]
 MACHINE = {"versions": {"jax": "1"}, "processor": "p", "cores": 2, "device": "cpu", "system": "s"}
 GOOD = {"algorithm": TREE, "seed": 3, "budget": {"generations": 5}, "machine": MACHINE}
 
@@ -118,8 +119,12 @@ def test_a_setting_changed_by_hand_is_refused(tmp_path):
     ("name", "value", "told"),
     [
         ("episodes", "10", "episodes of .*Neuroevolution is '10': it must be int"),
-        ("elite_fraction", "0.1", "elite_fraction of .* is '0.1': it must be float"),
-        ("elite_fraction", {"real": 0.1}, "elite_fraction of .* must be float"),
+        ("breeder", BREEDER | {"elite_fraction": "0.1"}, "elite_fraction of .* is '0.1': it must"),
+        (
+            "breeder",
+            BREEDER | {"elite_fraction": {"real": 0.1}},
+            "elite_fraction of .* must be float",
+        ),
         ("network", 3, "network of .* is 3: it must be"),
         ("env", None, "env of .* is None"),
     ],
