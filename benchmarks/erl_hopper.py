@@ -18,10 +18,11 @@ import pathlib
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import jax
 
-from credo.algorithms.erl import ERL
+from credo.algorithms.erl import BREEDER, ERL
 from credo.environments.gymnasium import Gymnasium
 from credo.learners.td3 import TD3
 from credo.networks.mlp import MLP
@@ -51,7 +52,7 @@ def measure(seconds: float) -> dict[str, float]:
         Gymnasium("Hopper-v5"),
         network,
         learners=(TD3(),),
-        elite_fraction=0.2,
+        breeder=replace(BREEDER, elite_fraction=0.2),
         test_episodes=1,
         test_every=1_000_000,
     )

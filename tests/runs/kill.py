@@ -41,17 +41,19 @@ TRAIN = {
     "--population-size 20 --episodes 5 --network.hidden 3",
     "bptt": "bptt sequence-recall --depth 2 --min-corridor 1 --max-corridor 3 --batch-size 20 "
     "--updates 2 --network.hidden 3 --train-size 100",
-    "ccea": "ccea credo.environments.probes:Meet --population-size 6 --elite-fraction 0.2 "
+    "ccea": "ccea credo.environments.probes:Meet --population-size 6 --breeder.elite-fraction 0.2 "
     "--teams 2 --episodes 2 --test-episodes 4 --network.hidden 4",
-    "islands": "ccea credo.environments.probes:Meet --population-size 6 --elite-fraction 0.34 "
+    "islands": "ccea credo.environments.probes:Meet --population-size 6 "
+    "--breeder.elite-fraction 0.34 "
     "--teams 2 --episodes 2 --test-episodes 4 --network.hidden 4 "
-    "islands:islands --islands.number 2 --islands.renewal 0.05",
+    "breeder.islands:islands --breeder.islands.number 2 --breeder.islands.renewal 0.05",
     "dmmu": "neuroevolution credo.environments.probes:Meet --network dmmu --network.hidden 3 "
-    "--population-size 6 --elite-fraction 0.2 --episodes 2 --test-episodes 4",
+    "--population-size 6 --breeder.elite-fraction 0.2 --episodes 2 --test-episodes 4",
     "erl": f"erl InvertedPendulum-v5 {SMALL} --sync-period 2",
     "cerl": f"cerl InvertedPendulum-v5 {SMALL}",
     "ea": "ea InvertedPendulum-v5 --network.hidden 8 --test-every 3 --max-episode-steps 40",
-    "merl": f"merl {TEAM} --population-size 6 --elite-fraction 0.34 --episodes 2 --workers 4 "
+    "merl": f"merl {TEAM} --population-size 6 --breeder.elite-fraction 0.34 --episodes 2 "
+    "--workers 4 "
     "--warmup-frames 200 --test-every 3 --migration-period 2",
     "td3": f"td3 {ALONE}",
     "ddpg": f"ddpg {ALONE}",

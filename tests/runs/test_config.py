@@ -35,8 +35,8 @@ def test_an_algorithm_comes_back_as_itself(preset, network):
 
 def test_floats_keep_every_bit():
     values = [0.1, 1 / 3, 1e-300, 5e-324, 1e12, -0.0]
-    algorithm = Neuroevolution(Copy(), MMU(hidden=2), crossover_probability=1 / 3)
-    assert there_and_back(algorithm).crossover_probability.hex() == (1 / 3).hex()
+    algorithm = Neuroevolution.as_written(Copy(), MMU(hidden=2), crossover_probability=1 / 3)
+    assert there_and_back(algorithm).breeder.crossover_probability.hex() == (1 / 3).hex()
     assert [v.hex() for v in there_and_back(values)] == [v.hex() for v in values]
 
 
@@ -113,7 +113,8 @@ def test_a_flat_tree_has_one_row_per_setting():
     assert flat["network"] == "MMU"
     assert flat["network.hidden"] == 2
     assert flat["episodes"] == 4
-    assert flat["mutation.strength"] == Neuroevolution(Copy(), MMU()).mutation.strength
+    strength = Neuroevolution(Copy(), MMU()).breeder.mutation.strength
+    assert flat["breeder.mutation.strength"] == strength
 
 
 def test_brief_is_the_task_on_one_line():
@@ -143,3 +144,13 @@ def test_every_field_of_an_algorithm_is_in_its_tree():
     algorithm = Neuroevolution.ours(SequenceClassification(depth=2), MMU(hidden=2))
     names = {field.name for field in dataclasses.fields(algorithm)}
     assert config.to_tree(algorithm).keys() == names | {"class"}
+
+
+def test_a_record_of_an_older_version_says_so():
+    tree = config.to_tree(Neuroevolution(Copy(), MMU(hidden=2)))
+    for old in (
+        tree | {"elite_fraction": 0.1},
+        tree | {"curriculum": {"class": "credo.evolution.curriculum:Curriculum", "start": 3}},
+    ):
+        with pytest.raises(config.ConfigError, match="was written by an older version of Credo"):
+            config.from_tree(old)

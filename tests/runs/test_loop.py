@@ -544,8 +544,9 @@ def test_a_run_with_a_mutation_of_a_script_can_be_reopened(tmp_path):
         "        return unravel(w + jax.random.normal(key, w.shape))\n"
         "if __name__ == '__main__':\n"
         "    task = credo.SequenceClassification(depth=2, min_gap=1, max_gap=1)\n"
-        "    algorithm = credo.Neuroevolution(task, credo.MMU(hidden=2), mutation=Nudge(),\n"
-        "                                     population_size=4)\n"
+        "    breeder = credo.Breeder(mutation=Nudge())\n"
+        "    algorithm = credo.Neuroevolution(task, credo.MMU(hidden=2), population_size=4,\n"
+        "                                     breeder=breeder)\n"
         "    credo.train(algorithm, generations=1, path='run', progress=False)\n"
     )
     done = subprocess.run(

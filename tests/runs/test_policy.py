@@ -139,7 +139,7 @@ def test_a_strangers_run_acts_and_is_exported_without_an_import(tmp_path, monkey
 
 def test_a_team_that_ccea_drafted_acts_agent_by_agent(tmp_path):
     spread, network = SimpleSpread(agents=2), MLP((3,))
-    algorithm = CCEA(spread, network, population_size=10, elite_fraction=0.2)
+    algorithm = CCEA.ccea(spread, network, population_size=10, elite_fraction=0.2)
     drafted = Team(trunk=(), head=network, sharing="nothing")
     policy = drafted.init(*spread.sizes, key=jax.random.key(0))
     boxes = [{"low": [0.0] * n, "high": [9.0] * n, "shape": [n], "dtype": "int32"} for n in (1, 2)]

@@ -14,6 +14,7 @@ from credo.runs.record import RunError
 from credo.runs.store import Run
 
 TREE = json.loads(json.dumps(config.to_tree(Neuroevolution(Copy(), MMU(hidden=2)))))
+BREEDER = TREE["breeder"]
 MACHINE = {"versions": {"jax": "1"}, "processor": "p", "cores": 2, "device": "cpu", "system": "s"}
 GOOD = {"algorithm": TREE, "seed": 3, "budget": {"generations": 5}, "machine": MACHINE}
 
@@ -120,8 +121,12 @@ def test_a_setting_changed_by_hand_is_refused(tmp_path):
     ("name", "value", "told"),
     [
         ("episodes", "10", "episodes of .*Neuroevolution is '10': it must be int"),
-        ("elite_fraction", "0.1", "elite_fraction of .* is '0.1': it must be float"),
-        ("elite_fraction", {"real": 0.1}, "elite_fraction of .* must be float"),
+        ("breeder", BREEDER | {"elite_fraction": "0.1"}, "elite_fraction of .* is '0.1': it must"),
+        (
+            "breeder",
+            BREEDER | {"elite_fraction": {"real": 0.1}},
+            "elite_fraction of .* must be float",
+        ),
         ("network", 3, "network of .* is 3: it must be"),
         ("env", None, "env of .* is None"),
     ],

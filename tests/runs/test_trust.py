@@ -1,6 +1,8 @@
 """Whose a run is, and that nothing which a stranger's record names is ever executed."""
 
+import functools
 import json
+import operator
 import os
 import subprocess
 import sys
@@ -109,16 +111,15 @@ def test_a_strangers_record_imports_nothing(tmp_path, monkeypatch, tree):
 
 
 @pytest.mark.parametrize("name", ["os:system", "subprocess:Popen", "builtins:eval"])
-@pytest.mark.parametrize("place", ["class", "env.class", "env.id", "mutation.class"])
+@pytest.mark.parametrize("place", ["class", "env.class", "env.id", "breeder.mutation.class"])
 def test_a_function_of_the_machine_is_never_called(tmp_path, monkeypatch, name, place):
     tree = json.loads(json.dumps(TREE))
     outer = place.rpartition(".")[0]
     if place == "env.id":
         tree["env"] = {"class": "credo.environments.gymnasium:Gymnasium", "id": name}
-    elif outer:
-        tree[outer]["class"] = name
     else:
-        tree["class"] = name
+        part = functools.reduce(operator.getitem, outer.split(".") if outer else (), tree)
+        part["class"] = name
     (tmp_path / "config.json").write_text(json.dumps(SAID | {"algorithm": tree}))
     with pytest.raises(config.ConfigError, match=f"names {name}, which is somebody's own code"):
         _ = Run(tmp_path).algorithm

@@ -142,8 +142,8 @@ def _made(cls: type, fields: dict[str, Any], at: str) -> Any:
     for key, value in fields.items():
         if key not in known:
             raise ConfigError(
-                f"{name} has no field {key!r}{suggestion(key, list(known))}: was this run "
-                "made by another version of Credo?"
+                f"{name} has no field {key!r}{suggestion(key, list(known))}: this was written by "
+                "an older version of Credo"
             )
         if key in kinds and value is not known[key].default and not _fits(value, kinds[key]):
             kind = inspect.formatannotation(kinds[key]).replace("credo.", "")
@@ -222,6 +222,10 @@ def find_class(name: str) -> type:
             raise ConfigError(
                 f"{attribute} was defined at a prompt or in a notebook and is known in that "
                 "process alone: put it into a file of its own, and import it from there"
+            ) from error
+        if module.split(".")[0] == "credo":
+            raise NotFound(
+                f"cannot find {name!r}: this was written by an older version of Credo"
             ) from error
         raise NotFound(
             f"cannot find {name!r} ({error}): install its package, or start Python where its "
