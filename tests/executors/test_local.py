@@ -14,6 +14,7 @@ import pytest
 
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.sequence_classification import SequenceClassification
+from credo.evolution.breeder import altered
 from credo.executors import local, worker
 from credo.networks.mmu import MMU
 from credo.runs import config, loop
@@ -164,13 +165,13 @@ def test_runs_go_on_with_another_setting_and_a_larger_budget(trained, tmp_path):
     (first, _, second), _ = trained
     paths = [shutil.copytree(job.path, tmp_path / job.path.name) for job in (first, second)]
     options = RunOptions(generations=7, tensorboard=False)
-    again = {"set": {"crossover_probability": 0.5}}
+    again = {"set": {"breeder.crossover_probability": 0.5}}
     local.run([local.Job.resumed(path, options, **again) for path in paths])
     for path in paths:
         run = loop.Run(path)
         assert run.metrics["generation"][-1] == 7
-        assert run.algorithm == dataclasses.replace(ALGORITHM, crossover_probability=0.5)
-        assert run.config["changes"][0]["set"] == {"crossover_probability": 0.5}
+        assert run.algorithm == altered(ALGORITHM, crossover_probability=0.5)
+        assert run.config["changes"][0]["set"] == {"breeder.crossover_probability": 0.5}
     local.run([local.Job.resumed(path, RunOptions()) for path in paths])  # nothing to do
     with pytest.raises(loop.RunError, match=f"{paths[0]}: this run's budget is 7 generations: a n"):
         local.Job.resumed(paths[0], RunOptions(generations=3)).finished()

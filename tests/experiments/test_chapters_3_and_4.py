@@ -208,7 +208,7 @@ def test_cells_of_chapter_4_have_the_published_sizes(name):
                 assert algorithm.env.partner == labels.get("partner")
             else:
                 assert algorithm.episodes == (30 if name in ("table-4.1", "fig-4.8") else 10)
-                assert len(algorithm.mating) == (1 if labels["network"] == "cnf" else 2)
+                assert len(algorithm.breeder.mating) == (1 if labels["network"] == "cnf" else 2)
 
 
 def test_cells_of_one_name_are_the_same_in_every_experiment():

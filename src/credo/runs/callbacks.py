@@ -190,7 +190,7 @@ class Listeners:
 class OnGeneration(Callback):
     """A plain function in the place of a callback."""
 
-    def __init__(self, function: Callable[..., bool | None]):
+    def __init__(self, function: Callable[..., Any]):
         self.on_generation = function
 
 
