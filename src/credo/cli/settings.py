@@ -1,8 +1,8 @@
 """All settings of a training as TOML, a line a flag: `credo train --config run.toml`."""
 
+import dataclasses
 import json
 import pathlib
-import re
 import tomllib
 from typing import Any
 
@@ -25,7 +25,7 @@ def read(path: str, *, trust: bool) -> list[tuple[str, list[str]]]:
             fail(f"{path} sets --{name}, which is for the command line alone")
         for value in values if not trust else ():
             team = name == "task" and "." in value and not value.startswith(OWN_TEAMS)
-            if team or re.search(r"\w:\w", value):
+            if team or ":" in value or "\\" in value:  # an escape may hide a colon
                 fail(
                     f"{path} names {value!r}, maybe code of others: look into it, and give --trust"
                 )
@@ -46,10 +46,16 @@ def written(command: Any, algorithm: Any) -> str:
     told = {"algorithm": command.algorithm, "task": command.task}
     for value, empty in ((command, (None, {}, ())), (algorithm, ())):
         line = Line("train", [])
+        # Names that are the command's own: a task's field of the same name is `env.…`.
+        line.reserved = _names(command, command.options, algorithm) - {"rewards", "kwargs"}
         line.skipped = {"algorithm", "task", "id", *OWN}
         line.take(value)
         told |= {flag.name: flag.value for flag in line.flags.values() if flag.value not in empty}
     return "".join(f"{json.dumps(name)} = {_toml(value)}\n" for name, value in told.items())
+
+
+def _names(*objects: Any) -> set[str]:
+    return {f.name.replace("_", "-") for x in objects for f in dataclasses.fields(x)}
 
 
 def _toml(value: Any) -> str:

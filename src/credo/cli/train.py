@@ -50,7 +50,8 @@ def run(line: Line) -> None:
     if files := [values for name, values in line.given if name == "config" and values]:
         from . import settings
 
-        trust = any(name == "trust" for name, _ in line.given)
+        said = [values for name, values in line.given if name == "trust"]
+        trust = bool(said) and said[-1][:1] in ([], ["True"], ["true"])
         line.filed = settings.read(files[-1][0], trust=trust)
         saved = dict(line.filed)
         words = [*saved.get("algorithm", []), *saved.get("task", [])]

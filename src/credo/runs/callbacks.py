@@ -151,7 +151,7 @@ class Listeners:
         """`score`: that of the test before; `every`: whether each generation makes a test."""
         self.run, self.callbacks = run, list(callbacks)
         self.score, self.every = score, every
-        self.error: Exception | None = None  # of a callback that is no logger
+        self.error: Exception | SystemExit | None = None  # of a callback that is no logger
 
     def hear(self, rows: Sequence[Metrics]) -> bool:
         """Tell of these generations; whether the run is to end."""
@@ -176,8 +176,8 @@ class Listeners:
         answers = []
         for callback in tuple(self.callbacks):
             try:
-                answers.append(getattr(callback, hook)(self.run, *what))
-            except Exception as error:
+                answers.append(bool(getattr(callback, hook)(self.run, *what)))
+            except (Exception, SystemExit) as error:
                 self.callbacks.remove(callback)
                 if not isinstance(callback, Logger):
                     self.error = self.error or error

@@ -280,8 +280,9 @@ def _reopened(
         change["generation"] = min(change["generation"], saved.generation)
     if settings:
         fit = _changed(run, fit, settings, saved.generation)
-        if any(name.startswith("env.") for name in settings):  # scores of another task
-            saved = dataclasses.replace(saved, extra=None)
+    later = [c for c in run.config.get("changes", []) if c["generation"] >= saved.generation]
+    if any(name.startswith("env.") for change in later for name in change.get("set", {})):
+        saved = dataclasses.replace(saved, extra=None)  # its score is of another task
     if budget != old:
         _note(run, saved.generation, budget=old.record())
         run.config["budget"] = budget.record()
@@ -400,8 +401,10 @@ class _Training:
             while not (self.reached or self.ended or signals.received):
                 self.dispatch()
             self.save()
-        except Exception:
+        except Exception as error:
             self.listeners.tell("on_end", "error")
+            if self.listeners.error not in (None, error):
+                error.add_note(f"a callback had raised before: {self.listeners.error!r}")
             raise
         reason = self.reason()
         self.listeners.end(reason)
