@@ -164,10 +164,9 @@ def kaiming(network: AbstractNetwork) -> Any:
 
 
 @jit
-def descend(
-    bptt: BPTT, state: BPTTState, *, key: PRNGKeyArray
-) -> tuple[BPTTState, Float[Array, " updates"], Int[Array, " updates"]]:
-    """`updates` steps of Adam. **Returns:** the state; loss and environment steps of each batch."""
+def descend(bptt: BPTT, state: BPTTState, *, key) -> tuple[BPTTState, Array, Array]:
+    """`updates` steps of Adam. **Returns:** the state; loss and environment steps of each batch,
+    `[updates]`."""
     dynamic, static = eqx.partition(state, eqx.is_array)
 
     def update(dynamic, key):

@@ -64,13 +64,14 @@ class CCEA(eqx.Module):
     breeder: Breeder = BREEDER  # how each population is followed by the next
     teams: int = eqx.field(static=True, default=5)  # φ: teams of an individual, on average, ≥ 1
     episodes: int = eqx.field(static=True, default=7)  # z: simulations of each team, ≥ 1
-    test_episodes: int = eqx.field(static=True, default=15)  # fresh ones per test, ≥ 1
+    test_episodes: int = eqx.field(static=True, default=15)  # episodes of a champion's test, ≥ 1
     teaming: Literal["random", "balanced"] = eqx.field(static=True, default="random")
     """How teams are drawn: `random`, so that an individual plays in φ on average, or `balanced`, so
     that it plays in exactly φ."""
     assignment: Literal["mean", "best"] = eqx.field(static=True, default="mean")
     """Fitness of an individual: the `mean` over its teams, or the `best` of them."""
-    fitness: str | None = eqx.field(static=True, default=None)  # reward's name; None: the first
+    fitness: str | None = eqx.field(static=True, default=None)
+    """Name of the reward that is assigned; None: the task\'s first."""
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Policies see observations normalised by the running mean and variance of all observations so
     far, which are recorded for it; the champion keeps them."""

@@ -74,7 +74,7 @@ class ERL(Hybrid):
     """The portfolio: each learns from the experience of all. Empty: evolution alone."""
     population_size: int = eqx.field(static=True, default=10)  # k: members, at least 2
     breeder: Breeder = BREEDER  # how the next population is made
-    episodes: int = eqx.field(static=True, default=1)  # ξ: averaged for one fitness value, ≥ 1
+    episodes: int = eqx.field(static=True, default=1)  # ξ: episodes per fitness value, ≥ 1
     remember: bool = eqx.field(static=True, default=False)
     """Rank a member by the average fitness over all generations that it lived through, not by the
     last one alone."""
@@ -84,11 +84,14 @@ class ERL(Hybrid):
     manager: AbstractManager | None = None  # allocates workers to learners; None: they go in turn
     sync_period: int = eqx.field(static=True, default=10)  # ω: generations between injections, ≥ 1
     updates_per_frame: float = 1.0  # gradient updates of each learner per frame played, ≥ 0
-    warmup_frames: int = eqx.field(static=True, default=1_000)  # played before learning begins, ≥ 0
-    replay_capacity: int = eqx.field(static=True, default=1_000_000)  # transitions, ≥ 1
-    test_episodes: int = eqx.field(static=True, default=5)  # fresh ones per test, ≥ 1
+    warmup_frames: int = eqx.field(static=True, default=1_000)  # frames before learning begins, ≥ 0
+    replay_capacity: int = eqx.field(
+        static=True, default=1_000_000
+    )  # transitions in the buffer, ≥ 1
+    test_episodes: int = eqx.field(static=True, default=5)  # episodes of a champion's test, ≥ 1
     test_every: int = eqx.field(static=True, default=1)  # generations from test to test, ≥ 1
-    fitness: str | None = eqx.field(static=True, default=None)  # reward's name; None: the first
+    fitness: str | None = eqx.field(static=True, default=None)
+    """Name of the reward that fitness sums up; None: the task\'s first."""
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Policies see observations normalised by the running mean and variance of all observations so
     far; the champion keeps them."""

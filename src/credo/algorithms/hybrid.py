@@ -150,12 +150,11 @@ Key = PRNGKeyArray
 Fitness = Float[Array, " pop"]
 Frames = Int[Array, ""]
 Result = tuple[HybridState, Metrics]
+Played = tuple[HybridState, Evaluation]
 UNMANAGED = UCB()  # keeps the ledger of learners that play in turn
 
 
-def play(
-    hybrid: Hybrid, state: HybridState, policies: PyTree, episodes: int, **how: Any
-) -> tuple[HybridState, Evaluation]:
+def play(hybrid: Hybrid, state: HybridState, policies, episodes: int, **how) -> Played:
     """Play, and store every transition in the replay buffer. `how`: arguments of `collect`.
 
     All of a generation act by the moments of those before; learners learn by those with what was
@@ -241,9 +240,7 @@ def _injected(population: PyTree, lineage: Lineage, actors: list[PyTree], due: B
     return tree.where(due, (population, lineage), before)
 
 
-def tested(
-    hybrid: Hybrid, state: HybridState, fitness: Fitness, metrics: Metrics, *, key: Key
-) -> Result:
+def tested(hybrid: Hybrid, state: HybridState, fitness, metrics: Metrics, *, key: Key) -> Result:
     """The champion on fresh episodes, every `test_every` generations. **Returns:** the state with
     the score of the last test, and all metrics of the generation."""
     due = (state.generation - 1) % hybrid.test_every == 0

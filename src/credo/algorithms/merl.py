@@ -59,15 +59,16 @@ class MERL(Hybrid):
     learners: tuple[AbstractLearner, ...] = (LOCAL,)  # of the whole team, each of its own reward
     population_size: int = eqx.field(static=True, default=20)  # k: teams, at least 2
     breeder: Breeder = BREEDER  # how the next population is made
-    episodes: int = eqx.field(static=True, default=10)  # ξ: averaged for one fitness value, ≥ 1
+    episodes: int = eqx.field(static=True, default=10)  # ξ: episodes per fitness value, ≥ 1
     workers: int = eqx.field(static=True, default=50)  # learners' episodes per generation, ≥ 1
     migration_period: int = eqx.field(static=True, default=1)  # generations between migrations, ≥ 1
     updates_per_frame: float = 0.1  # updates of each learner, for all agents, per frame played, ≥ 0
-    warmup_frames: int = eqx.field(static=True, default=5_120)  # played before learning begins, ≥ 0
-    replay_capacity: int = eqx.field(static=True, default=100_000)  # transitions, ≥ 1
-    test_episodes: int = eqx.field(static=True, default=10)  # fresh ones per test, ≥ 1
+    warmup_frames: int = eqx.field(static=True, default=5_120)  # frames before learning begins, ≥ 0
+    replay_capacity: int = eqx.field(static=True, default=100_000)  # transitions in the buffer, ≥ 1
+    test_episodes: int = eqx.field(static=True, default=10)  # episodes of a champion's test, ≥ 1
     test_every: int = eqx.field(static=True, default=1)  # generations from test to test, ≥ 1
-    fitness: str | None = eqx.field(static=True, default=None)  # reward's name; None: the first
+    fitness: str | None = eqx.field(static=True, default=None)
+    """Name of the reward that fitness sums up; None: the task\'s first."""
     redistribute: bool = eqx.field(static=True, default=False)
     """Learners see each episode's return in equal parts over its frames, however late it came."""
     normalize_observations: bool = eqx.field(static=True, default=False)

@@ -73,8 +73,8 @@ class Neuroevolution(eqx.Module):
     network: AbstractNetwork
     population_size: int = eqx.field(static=True, default=100)  # k: members, at least 2
     breeder: Breeder = Breeder()  # how the next population is made
-    episodes: int = eqx.field(static=True, default=10)  # averaged for one fitness value, ≥ 1
-    test_episodes: int = eqx.field(static=True, default=50)  # fresh ones per test, ≥ 1
+    episodes: int = eqx.field(static=True, default=10)  # episodes per fitness value, ≥ 1
+    test_episodes: int = eqx.field(static=True, default=50)  # episodes of a champion's test, ≥ 1
     elite_memory: int = eqx.field(static=True, default=1)
     """Generations over which an elite's fitness is averaged, ≥ 1; after so many the newest counts
     one such part. 1: the last generation alone."""

@@ -47,14 +47,16 @@ class OffPolicy(eqx.Module):
     env: Environment
     network: AbstractNetwork = TD3_NETWORK
     learner: AbstractLearner = TD3()
-    episodes: int = eqx.field(static=True, default=1)  # played between rounds of updates, ≥ 1
-    start_frames: int = eqx.field(static=True, default=25_000)  # with random actions at first, ≥ 0
+    episodes: int = eqx.field(static=True, default=1)  # episodes between rounds of updates, ≥ 1
+    start_frames: int = eqx.field(static=True, default=25_000)  # frames of random actions, ≥ 0
     updates_per_frame: float = 1.0  # gradient updates per environment frame, at least 0
     redistribute: bool = eqx.field(static=True, default=False)
     """The learner sees each episode's return in equal parts over its frames."""
-    test_episodes: int = eqx.field(static=True, default=10)  # fresh ones per test, ≥ 1
+    test_episodes: int = eqx.field(static=True, default=10)  # episodes of an actor's test, ≥ 1
     test_every: int = eqx.field(static=True, default=5_000)  # frames between tests, at least 1
-    replay_capacity: int = eqx.field(static=True, default=1_000_000)  # transitions, ≥ 1
+    replay_capacity: int = eqx.field(
+        static=True, default=1_000_000
+    )  # transitions in the buffer, ≥ 1
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Actor and critics see observations normalised by the running mean and variance of all
     observations so far; the champion keeps them."""

@@ -94,9 +94,10 @@ class PPO(eqx.Module):
     value_weight: float = 0.5  # of the critic's squared error in the loss, at least 0
     max_norm: float = 0.5  # norm to which the gradient is clipped, at least 0
     first_std: float = 0.6  # of the noise at first, ≥ 0, in units of actions, which lie in [-1, 1]
-    test_episodes: int = eqx.field(static=True, default=10)  # fresh ones per test, ≥ 1
+    test_episodes: int = eqx.field(static=True, default=10)  # episodes of a policy's test, ≥ 1
     test_every: int = eqx.field(static=True, default=5_000)  # frames between tests, at least 1
-    signal: str | None = eqx.field(static=True, default=None)  # reward's name; None: the first
+    signal: str | None = eqx.field(static=True, default=None)
+    """Name of the reward that is maximised; None: the task\'s first."""
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Actor and critic see observations normalised by the running mean and variance of all
     observations so far; the champion keeps them."""

@@ -99,10 +99,9 @@ def averaged(total: Metrics, count: Int[Array, ""]) -> Metrics:
     return jax.tree.map(lambda x: jnp.where(count > 0, x / n, NOTHING), total)
 
 
-def adam(
-    weights: PyTree, gradient: PyTree, state: optax.OptState, rate: Any, max_norm: Any = None
-) -> tuple[PyTree, optax.OptState]:
-    """One step of Adam (Kingma & Ba 2015) down the gradient, clipped to a global norm."""
+def adam(weights, gradient, state, rate, max_norm=None) -> tuple[PyTree, optax.OptState]:
+    """One step of Adam (Kingma & Ba 2015) down the gradient, clipped to a global norm unless that
+    is None. **Returns:** the weights, and the state of Adam."""
     # Optax multiplies counters by floats, which strict promotion of dtypes would refuse.
     with jax.numpy_dtype_promotion("standard"):
         if max_norm is not None:
@@ -116,9 +115,7 @@ def adam_state(weights: PyTree) -> optax.OptState:
     return optax.adam(0.0).init(eqx.filter(weights, eqx.is_inexact_array))
 
 
-def descend(
-    loss: Callable[..., Any], given: tuple, state: optax.OptState, rate: Any, max_norm: Any = None
-) -> tuple[PyTree, optax.OptState, Any]:
+def descend(loss: Callable[..., Any], given, state, rate, max_norm=None) -> tuple[Any, Any, Any]:
     """One step of `adam` down the gradient of `loss(*given)` by its first argument, the weights.
 
     **Returns:** the weights, the state of Adam, and what the loss returned: its value and a second

@@ -97,7 +97,7 @@ class SAC(AbstractLearner):
     tau: float = 5e-3  # share of the new weights in the target networks per update, in [0, 1]
     target_entropy: float = -1.0  # of the policy, in nats per action dimension
     reward_scale: float = 1.0  # factor of all rewards that critics see, ≥ 0
-    critics: int = eqx.field(static=True, default=2)  # the target is their minimum, ≥ 1
+    critics: int = eqx.field(static=True, default=2)  # number; the target is their minimum, ≥ 1
     batch_size: int = eqx.field(static=True, default=256)  # transitions per update, ≥ 1
     signal: str | None = eqx.field(static=True, default=None)
     """Name of the reward that it maximises; None: that of its algorithm."""

@@ -78,12 +78,12 @@ class TD3(AbstractLearner):
     critic_lr: float = 3e-4  # learning rate of the critics' Adam, ≥ 0
     tau: float = 5e-3  # share of the new weights in the target networks per update, in [0, 1]
     target_noise: float = 0.2  # std of the noise on target actions, ≥ 0, in units of actions
-    target_noise_clip: float = 0.5  # that noise is clipped to plus and minus this, ≥ 0
-    noise: AbstractNoise = GaussianNoise()  # of exploration
-    critics: int = eqx.field(static=True, default=2)  # the target is their minimum, ≥ 1
+    target_noise_clip: float = 0.5  # largest magnitude of the noise on target actions, ≥ 0
+    noise: AbstractNoise = GaussianNoise()  # on the actor's actions while it explores
+    critics: int = eqx.field(static=True, default=2)  # number; the target is their minimum, ≥ 1
     policy_delay: int = eqx.field(static=True, default=2)  # critic updates per actor update, ≥ 1
-    actor_max_norm: float | None = None  # norm to which its gradient is clipped; None: not
-    critic_max_norm: float | None = None  # norm to which theirs is clipped; None: not
+    actor_max_norm: float | None = None  # bound on the norm of the actor's gradient; None: none
+    critic_max_norm: float | None = None  # bound on the norm of the critics' gradient; None: none
     actor_scale: float = 1.0  # factor of the weights in the fresh actor's output layer
     bootstrap_truncated: bool = eqx.field(static=True, default=True)
     """A time limit is not the end of the task; False: it counts as one, as in the author's code."""
