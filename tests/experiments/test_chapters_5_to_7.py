@@ -247,7 +247,7 @@ def test_fates_stand_beside_the_published_ones_and_chance(trained):
     # Simulated: ranks drawn at random meet the tournaments of ERL itself.
     erl = cell.cell.algorithm
     fitness = -np.arange(10.0, dtype=np.float32)
-    draw = jax.vmap(lambda key: erl.selection(fitness, 10 - erl.elites, key=key))
+    draw = jax.vmap(lambda key: erl.breeder.selection(fitness, 10 - erl.elites, key=key))
     drawn = np.asarray(draw(jax.random.split(jax.random.key(0), 4000)))
     chosen = (drawn[:, :, None] == np.arange(10)).any(axis=1)[:, erl.elites :]
     expected = [row.value for row in found.rows if row.metric == "by chance"]
@@ -290,7 +290,7 @@ def test_a_report_shows_attribution_where_there_is_any(trained, tmp_path):
     paths = [run.path for cell in cells for run in trained(cell).runs]
     html = run_page.write(paths, tmp_path / "report.html").read_text()
     # One portfolio: two lines of figures and one table of learners.
-    for title in ("Who was the last to change", "Where the champion&#x27;s weights", "Workers of"):
+    for title in ("Who was the last to change", "s weights come from", "Workers of"):
         assert html.count(f"{title}") >= 1
     assert html.count("Learners: their workers") >= 1
     assert "TD3 γ 0.9995" in html
