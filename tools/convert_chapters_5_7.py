@@ -1,5 +1,6 @@
 """What old results of chapters 5 to 7 and of the checks have where, and what their names mean."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -13,15 +14,12 @@ RENAMED = {
     "erl no selection": "erl without selection",
 }
 NUMBERED = {"gamma": "gamma", "c": "exploration"}  # "td3 gamma 0.9", "cerl c 5"
-ONLY = {  # regular expressions that a command had for cells, where the names are others now
+ONLY = {  # a regular expression that a command had for cells, where the names are others now
     "'^((erl|ddpg|ea|erl ours) Inv.*v5$|(ddpg|ddpg spread|ea|erl ours) .* delayed)'": (
         "'^((erl|ddpg|ea|erl ours), Inv.*v5$|(ddpg|ddpg spread|ea|erl ours), .* delayed)'"
     ),
-    "'^ea Swimmer'": "'^ea, Swimmer'",
-    "'^ea HalfCheetah'": "'^ea, HalfCheetah'",
-    "'^cerl Swimmer'": "'^cerl, Swimmer'",
-    "'^(cerl|td3) Swimmer'": "'^(cerl|td3), Swimmer'",
 }
+METHOD_TASK = re.compile(r"'\^(\w+|\([\w| ]+\)) (?=[A-Z])")  # '^ea Swimmer', now '^ea, Swimmer'
 
 
 def result(
@@ -46,6 +44,7 @@ def result(
     command = old["command"]
     for before, after in ONLY.items():
         command = command.replace(before, after)
+    command = METHOD_TASK.sub(r"'^\1, ", command)
     return Results(old["experiment"], old["budget"], command, told, *concat(parts))
 
 

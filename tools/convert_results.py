@@ -11,6 +11,7 @@ checkout.
 
 import json
 import re
+import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -57,6 +58,10 @@ def convert(path: Path) -> tuple[Results, dict[str, Any]]:
     new = converters()[old["experiment"]](old)
     cells = [cell | {"algorithm": modern(cell["algorithm"])} for cell in new.cells]
     new = replace(new, cells=cells)
+    words = shlex.split(new.command)
+    for pattern in [words[i + 1] for i, word in enumerate(words) if word == "--only"]:
+        if not any(re.search(pattern, base.named(x["labels"]), re.IGNORECASE) for x in cells):
+            raise ValueError(f"{path}: no cell has {pattern!r} in its name any more")
     line = compare(old, new)
     page = path.with_name("report.html")
     return new, line | (pages(page.read_text(), new) if page.exists() else {})
