@@ -1,16 +1,21 @@
 """Who hears of a run: hooks in order, loggers that may fail, callbacks that may not."""
 
+import shutil
 import struct
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from credo.algorithms.erl import ERL
 from credo.algorithms.neuroevolution import Neuroevolution
+from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
+from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.runs import callbacks, log
 from credo.runs.callbacks import Callback, Listeners, TensorBoard
@@ -171,6 +176,36 @@ def test_without_a_best_policy_there_is_a_sentence(tmp_path):
     (run.path / "best.safetensors").unlink()
     with pytest.raises(RunError, match=r"best\.safetensors is not there"):
         _ = run.best
+
+
+def test_a_score_of_the_task_before_is_no_best_one(tmp_path):
+    """Of several generations one test; the others repeat its score, also that of another task."""
+    evolution = ERL.ea(Copy(), MLP(hidden=(4,)), population_size=4, elite_fraction=0.25)
+    algorithm = replace(evolution, test_every=5, test_episodes=2, replay_capacity=1000)
+    run = train(algorithm, generations=7, path=tmp_path / "run", **QUIET)
+    assert run.best_test[0] in (1, 6)
+    resume(run.path, set={"env.max_steps": 3}, generations=9, **QUIET)
+    assert not (run.path / "best.safetensors").exists()
+    run = resume(run.path, generations=12, **QUIET)
+    assert run.best_test[0] == 11
+    assert run.best_test[1] == pytest.approx(run.metrics["champion_score"][10])
+
+
+def test_a_kill_after_another_task_was_set_brings_no_old_best_back(tmp_path):
+    run = train(ALGORITHM, generations=4, path=tmp_path / "run", **QUIET)
+    other = tmp_path / "other"
+    shutil.copytree(run.path, other)
+    again = {"set": {"env.depth": 3}, "generations": 7}
+    run = resume(run.path, **again, **QUIET)
+
+    def killed(run, generation, metrics):
+        raise KeyboardInterrupt  # nothing is saved
+
+    with pytest.raises(KeyboardInterrupt):
+        resume(other, **again, callbacks=(killed,), **QUIET)
+    resume(other, generations=7, **QUIET)
+    assert Run(other).best_test == run.best_test
+    assert (other / "best.safetensors").read_bytes() == (run.path / "best.safetensors").read_bytes()
 
 
 # Loggers.

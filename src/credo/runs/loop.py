@@ -61,11 +61,19 @@ class Best(eqx.Module):
     policy: PyTree  # its arrays alone
     score: Float[Array, ""]  # NOTHING before the first test
     generation: Int[Array, ""]
+    stale: Float[Array, ""]
+    """A score of a test before the first that counts, which generations without a test of their own
+    repeat; NOTHING if there is none."""
 
     @classmethod
-    def none(cls, policy: PyTree) -> "Best":
+    def none(cls, policy: PyTree, stale: float = NOTHING) -> "Best":
         """Before the first test, with copies of a policy's arrays: a state is donated."""
-        return cls(jax.tree.map(np.array, policy), np.float32(NOTHING), np.int32(0))  # pyright: ignore[reportArgumentType]
+        numbers: Any = np.float32(NOTHING), np.int32(0), np.float32(stale)
+        return cls(jax.tree.map(np.array, policy), *numbers)
+
+    def beaten(self, score: Any) -> Any:
+        """Whether a generation's score is that of a better policy; False of NaN."""
+        return (score > self.score) & (score != self.stale)
 
 
 @screen.calm()
@@ -243,7 +251,7 @@ def _load(run: Run, algorithm: Any, without_replay: bool = False) -> checkpoint.
 
     like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0))
     like, static = eqx.partition(like, lambda x: isinstance(x, jax.ShapeDtypeStruct))
-    number = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((), jnp.int32)
+    number = [jax.ShapeDtypeStruct((), x) for x in (jnp.float32, jnp.int32, jnp.float32)]
     saved = checkpoint.load(
         run.path / "checkpoints",
         like,
@@ -374,13 +382,13 @@ class _Training:
             Budget.read(run.config["budget"]),
         )
         self.generation, self.frames = saved.generation, int(saved.counters["frames"])
-        arrays = eqx.filter(saved.state.champion, eqx.is_array)
-        self.state, self.best = saved.state, saved.extra or Best.none(arrays)
         self.safe, self.chunk = saved.generation, 1
         self.journal = log.Log(run.path, self.generation)
         score = float(log.last(run.path / log.METRICS).get("champion_score", -np.inf))
         self.reached = self.budget.reached(self.generation, self.frames, score)
         every = getattr(algorithm, "test_every", 1) == 1
+        arrays, stale = eqx.filter(saved.state.champion, eqx.is_array), NOTHING if every else score
+        self.state, self.best = saved.state, saved.extra or Best.none(arrays, stale)
         self.listeners = callbacks.Listeners(run, heard, score, every)
         self.ended = ""  # why, if neither the budget nor a signal is
         self.bar = Progress(run.path, self.generation, self.frames, self.budget, options.progress)
@@ -492,6 +500,8 @@ class _Training:
             told = metadata | {"generation": str(int(self.best.generation))}
             told |= {"score": repr(float(self.best.score))}
             checkpoint.export_policy(path / BEST, self.best.policy, told)
+        else:
+            files.remove(path / BEST)  # of another task
         self.safe = generation
 
 
@@ -515,9 +525,9 @@ def play(
         state, metrics = algorithm.generation(state, key=jax.random.fold_in(root, generation + 1))
         columns, count = jax.tree.map(lambda x: np.asarray(x)[None], metrics), 1
         score = columns["champion_score"][0]
-        if score > best.score:
+        if best.beaten(score):
             arrays = Best.none(eqx.filter(state.champion, eqx.is_array)).policy
-            best = Best(arrays, score, np.int32(generation + 1))  # pyright: ignore[reportArgumentType]
+            best = Best(arrays, score, np.int32(generation + 1), best.stale)  # pyright: ignore[reportArgumentType]
     else:
         n = min(n, CHUNK, (budget.generations or MOST) - generation)
         left = MOST if budget.frames is None else min(budget.frames - frames, MOST)
@@ -560,8 +570,8 @@ def advance(fixed: tuple[Any, ...], state: PyTree, best: Best):
         dynamic, metrics = one(dynamic, i)
         kept = jax.tree.map(lambda xs, x: xs.at[i].set(x), kept, metrics)
         left, score = left - metrics["frames"].astype(jnp.int32), metrics["champion_score"]
-        new = Best(dynamic.champion, score, generation + i + 1)
-        better = score > best.score  # False of NaN
+        new = Best(dynamic.champion, score, generation + i + 1, best.stale)
+        better = best.beaten(score)
         best = jax.tree.map(lambda a, b: jnp.where(better, b, a), best, new)
         return i + 1, left, dynamic, best, score, kept
 
