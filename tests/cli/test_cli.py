@@ -549,15 +549,19 @@ def test_all_settings_are_written_and_read(credo, tmp_path, monkeypatch):
         'rewards = ["global=stranger_1:pay"]',
         'kwargs = ["task=stranger_1:f"]',
         'trust = true\nlearner = "stranger_1:Learner"',
+        'learner = "stranger-:Learner"',
+        "rewards = [\"global='stranger_1\\\\x3apay'\"]",
     ],
 )
-def test_a_file_of_settings_names_no_code_without_trust(credo, tmp_path, monkeypatch, text):
+@pytest.mark.parametrize("trust", ["", "--trust False", "--trust=false"])
+def test_a_file_of_settings_names_no_code_without_trust(credo, tmp_path, monkeypatch, text, trust):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "kept").mkdir()
-    (tmp_path / "stranger_1.py").write_text("open('begun', 'w')")
+    for name in ("stranger_1.py", "stranger-.py"):
+        (tmp_path / name).write_text("open('begun', 'w')")
     (tmp_path / "run.toml").write_text(text)
     words = "" if text.startswith("algorithm") else "td3 Pendulum-v1"
-    code, _, err = credo(f"train {words} --config run.toml")
+    code, _, err = credo(f"train {words} --config run.toml {trust}")
     assert code == 2
     told = "maybe code of others: look into it, and give --trust"
     assert ("for the command line alone" if "trust =" in text else told) in err

@@ -138,6 +138,22 @@ def test_what_a_callback_raises_comes_once_the_run_is_saved(tmp_path):
         assert (path / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
 
 
+def leaves(run, generation, metrics):
+    raise SystemExit(3)
+
+
+def undecided(run, generation, metrics):
+    return np.ones(2)  # neither true nor false
+
+
+@pytest.mark.parametrize(("callback", "raised"), [(leaves, SystemExit), (undecided, ValueError)])
+def test_a_run_is_saved_however_a_callback_ends_it(tmp_path, callback, raised):
+    with pytest.raises(raised):
+        train(ALGORITHM, generations=40, path=tmp_path / "run", callbacks=(callback,), **QUIET)
+    assert Run(tmp_path / "run").metrics["generation"].tolist() == [1]
+    assert (tmp_path / "run" / "champion.safetensors").exists()
+
+
 def test_what_is_no_callback_is_refused(tmp_path):
     with pytest.raises(TypeError, match="3 is no callback"):
         train(ALGORITHM, path=tmp_path / "run", callbacks=(3,))
