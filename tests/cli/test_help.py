@@ -48,7 +48,6 @@ def offered(algorithm: str) -> dict[str, str]:
     return {flag.name: flag.text for flag in line.flags.values()}
 
 
-@pytest.mark.xfail(reason="algorithms, learners and operators get their texts with the breeder")
 @pytest.mark.parametrize("algorithm", list(names.ALGORITHMS))
 def test_every_flag_has_a_text(algorithm):
     texts = offered(algorithm)

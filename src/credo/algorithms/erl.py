@@ -18,8 +18,9 @@ Departures from the printed boxes:
 - All members of a generation play in the same worlds; crossover draws rows independently.
 - A learner's first return is its value, and returns that are no numbers leave it as it is.
 - Time limits bootstrap, both gradients are clipped, and OU noise starts anew with each episode.
-- No actor is injected in a generation without updates, and episodes in which somebody says NaN
-  are not remembered.
+- No actor is injected in a generation without updates.
+- Non-finite episodes (an observation, action or reward that is NaN or infinite) are discarded: they
+  do not enter the replay buffer.
 """
 
 from collections.abc import Callable

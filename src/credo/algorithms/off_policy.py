@@ -46,7 +46,7 @@ class OffPolicy(eqx.Module):
 
     env: Environment
     network: AbstractNetwork = TD3_NETWORK
-    learner: AbstractLearner = TD3()
+    learner: AbstractLearner = TD3()  # what learns from the replay buffer: TD3, DDPG, SAC, …
     episodes: int = eqx.field(static=True, default=1)  # episodes between rounds of updates, ≥ 1
     start_frames: int = eqx.field(static=True, default=25_000)  # frames of random actions, ≥ 0
     updates_per_frame: float = 1.0  # gradient updates per environment frame, at least 0

@@ -322,7 +322,7 @@ class _Plan:
         return won * _ways(self.env) ** moves_to_come, list(told.values())
 
     def _next(self, trial: int, worlds: Weights) -> int:
-        """Value of what is believed after a trial, before the reward moves, if now it does."""
+        """Value of the belief after a trial, with the reward moved if this is where it moves."""
         if trial % self.env.endpoints or trial == self.env.trials:
             return self.value(trial, worlds)
         moved = _moved(self.env, {(world, None): weight for world, weight in worlds.items()})

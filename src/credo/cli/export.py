@@ -10,7 +10,7 @@ from .names import fail
 
 @dataclasses.dataclass
 class Export:
-    """A run's policy in one file that acts without JAX (`credo.Runner`); the file is
+    """A run's policy in one file that acts without JAX (`credo.Runner.load(FILE)`); the file is
     policy.safetensors of the run's folder if none is named."""
 
     run: str
@@ -29,6 +29,7 @@ def run(line: Line) -> None:
     run = one_run("export", command.run, trust=command.trust, best=command.best)
     target = pathlib.Path(command.file) if command.file else run.path / "policy.safetensors"
     print(f"policy: {export.export(run, target)}")
+    print(f'use it: policy = credo.Runner.load("{target}"); action = policy(observation)')
 
 
 def one_run(command: str, path: str, **options: bool) -> Any:

@@ -6,7 +6,7 @@ from typing import Any
 
 from ..runs.options import RunOptions
 from .line import Line, shorts
-from .names import fail
+from .names import CATALOGUE, fail
 
 BEGUN = {"seed": "a run's seed stays: start another with `credo train`"}
 BEGUN |= dict.fromkeys(("frames", "generations", "stop_at"), "a budget is a flag: --frames 2e6")
@@ -19,7 +19,8 @@ class Resume:
     run: str
     _: dataclasses.KW_ONLY
     set: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """FIELD=VALUE, such as learner.actor_lr=1e-4: go on with another setting, which is recorded."""
+    """FIELD=VALUE, such as learning_rate=1e-4 or gamma=0.95: go on with another setting, which is
+    recorded."""
     trust: bool = False  # the run was made elsewhere and names code of others: import it
     without_replay: bool = False  # start with an empty replay buffer, where its files are damaged
     options: RunOptions = RunOptions()  # noqa: RUF009
@@ -28,6 +29,9 @@ class Resume:
 def run(line: Line) -> None:
     """Go on; several runs in processes of their own."""
     command = line.command(Resume)
+    for name in [name for name, _ in line.given if name in CATALOGUE["short"]]:
+        setting = name.replace("-", "_")
+        fail(f"--{name} is a setting of the run's algorithm: give it as --set {setting}=VALUE")
     line.done()
     from ..executors import local
     from ..runs import config, folder, loop

@@ -151,7 +151,8 @@ def _start(command: Train, algorithm: Any) -> None:
         [
             local.Job(path / f"seed-{seed}", algorithm, seed, command.options, command.from_)
             for seed in seeds
-        ]
+        ],
+        again="the same command" + f" with --path {path}" * (not command.path),
     )
     for seed in seeds:
         print(Run(path / f"seed-{seed}").summary)

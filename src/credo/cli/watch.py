@@ -11,7 +11,8 @@ from .line import Line
 
 @dataclasses.dataclass
 class Watch:
-    """Show a run's policy: a page that plays (.html), or a video (.gif, .mp4)."""
+    """Show a run's policy: rovers, mazes, fleets and sequences in a page that plays (.html); tasks
+    of Gymnasium, PettingZoo and your own that can draw themselves in a video (.gif, .mp4)."""
 
     run: str
     file: str | None = None

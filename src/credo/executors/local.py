@@ -160,13 +160,20 @@ class Job:
 
 
 @screen.calm()
-def run(jobs: Sequence[Job], workers: int | None = None, *, title: str = "runs") -> None:
+def run(
+    jobs: Sequence[Job],
+    workers: int | None = None,
+    *,
+    title: str = "runs",
+    again: str = "the same command",
+) -> None:
     """Train every unfinished job.
 
     Says which runs a limit of the clock left unfinished, and how to go on with them.
 
     **Arguments:** `workers`: processes at a time, at least 1; None: one per core that this process
-    may use. `title`: what stands before the line or bar that shows how far they are.
+    may use. `title`: what stands before the line or bar that shows how far they are. `again`: what
+    goes on with these jobs, in words; those that had not begun are among them.
 
     **Raises:** `RunError` if a folder holds another run, before anything is started, or with all
     failures once every job was tried; `Interrupted` after a signal: the workers save first.
@@ -180,13 +187,12 @@ def run(jobs: Sequence[Job], workers: int | None = None, *, title: str = "runs")
     crew = _Crew(waiting, Board(title, len(jobs), len(waiting)))
     number = crew.work(min(workers or len(config.available_cores()), len(waiting)))
     if number:
-        raise Interrupted("stopped and saved; the same command goes on where it was", 128 + number)
+        raise Interrupted(f"stopped and saved; {again} goes on where it was", 128 + number)
     if crew.failures:
         told = "\n".join(crew.failures)
         raise RunError(f"{len(crew.failures)} of {len(waiting)} runs failed:\n{told}")
     if left := [job for job in waiting if not job.finished()]:
-        names, folders = ", ".join(job.state() for job in left), {job.path.parent for job in left}
-        again = f"`credo resume {folders.pop()}`" if len(folders) == 1 else "the same command"
+        names = ", ".join(job.state() for job in left)
         screen.say(
             f"credo: {len(left)} of {len(jobs)} runs are not finished for want of time ({names}): "
             f"go on with {again}"

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from . import files
+from . import files, screen
 from .config import to_tree
 from .lock import is_lock, lock
 from .names import run_name
@@ -43,6 +43,8 @@ def free_name(algorithm: Any, seed: int | str, label: str = "") -> pathlib.Path:
     while path.exists():
         copies += 1
         path = pathlib.Path("runs") / f"{name}-{copies}"
+    if copies > 1:
+        screen.say(f"credo: runs/{name} is there already: this run goes to {path}")
     return path
 
 

@@ -2,8 +2,8 @@
 and TensorBoard events.
 
 Only the first is worth an error. Each checkpoint seals the rows up to its own (`seal`, `verify`):
-a file that somebody cut, mixed up or damaged is named before a number in it is believed. What goes
-wrong with the other two is a warning, once, and training goes on without them.
+a file that was cut, reordered or damaged is refused by name before a number in it is used. An error
+of the other two is a warning, once, and training goes on without them.
 """
 
 import contextlib
