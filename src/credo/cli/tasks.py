@@ -13,6 +13,7 @@ from ..environments.base import AbstractEnvironment
 from ..environments.gymnasium import Gymnasium
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..environments.pettingzoo import PettingZoo
+from ..require import suggestion
 from ..runs.ending import first, say
 from .names import CATALOGUE, TASKS, fail, load, of_user
 from .values import pairs
@@ -88,8 +89,8 @@ def _own(name: str, kwargs: dict[str, Any]) -> Any:
     found = of_user(name)
     module, _, missing = name.partition(":")
     if found is None:
-        why = f"{module} has no {missing}"
-        fail(f"cannot import {name!r}: {why}. Start credo in the folder of its file")
+        there = [x for x in vars(sys.modules[module]) if not x.startswith("_")]
+        fail(f"cannot import {name!r}: {module} has no {missing}{suggestion(missing, there)}")
     if isinstance(found, type) and issubclass(found, AbstractEnvironment | AbstractHostEnvironment):
         return of_user(name, found)
     kind = of_user(name, lambda: names.kind_of(name, kwargs))

@@ -60,6 +60,10 @@ def run(line: Line) -> None:
     if command.algorithm and command.algorithm not in ALGORITHMS:
         fail(f"no algorithm {command.algorithm!r}", command.algorithm, ALGORITHMS)
     if not (command.task or (line.help and command.algorithm)):
+        if command.algorithm and not line.help:
+            tasks = {"a team": "rover", "labelled sequences": "sequence-recall"}
+            task = tasks.get(ALGORITHMS[command.algorithm].get("learns", ""), "Hopper-v5")
+            say(f"credo: a task is missing, as in credo train {command.algorithm} {task}\n")
         line.end()
     algorithm = _algorithm(line, command)
     line.done()
