@@ -35,12 +35,12 @@ def write(page: Page, path: str | os.PathLike[str]) -> Path:
 
 def render(page: Page) -> str:
     """The page as HTML."""
-    text = {name: files.read_text(STATIC / name) for name in ("page.css", "page.js")}
+    text = {name: files.read_text(STATIC / name) for name in ("base.css", "page.css", "page.js")}
     return _template("page.html").render(
         page=page,
         groups=groups(drawn(page)),
         themes={"light": LIGHT, "dark": DARK},
-        css=text["page.css"],
+        css=text["base.css"] + text["page.css"],
         script=text["page.js"],
     )
 

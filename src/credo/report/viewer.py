@@ -68,7 +68,7 @@ def page(
         speeds=[f"{s:g}" for s in sorted({*SPEEDS, speed})],
         speed=f"{speed:g}",
         data=_inside_script(json.dumps(_short(data), separators=(",", ":"), allow_nan=False)),
-        style=Markup(_text("static/viewer.css")),
+        style=Markup(_text("static/base.css") + _text("static/viewer.css")),
         player=Markup(_text("static/viewer.js")),
         script=Markup(own.read_text("utf-8") if own.suffix == ".js" else _text(known)),
     )
