@@ -121,7 +121,7 @@ def test_list_names_everything(credo):
         ("train neuroevolution os:sep", "os:sep is no task", "derive it from credo.Abstract"),
         ("check os:getcwd", "os:getcwd is no task", "derive it from credo.AbstractEnvironment"),
         ("check :Task", "no task ':Task'", "written package.module:name"),
-        ("check os:Nothing", "cannot import 'os:Nothing'", "folder of its file"),
+        ("check os:Nothing", "cannot import 'os:Nothing'", "os has no Nothing"),
         ("train neuroevolution sequence-recall --network lstn", "no network 'lstn'", "'lstm'?"),
         ("train neuroevolution sequence-recall --preset our", "no preset 'our'", "'ours'?"),
         ("train neuroevolution sequence-recall --network", "--network needs a value", ""),
