@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from . import memory, require
 from .compilation import jit
@@ -23,6 +23,35 @@ from .types import Transition
 _filled = contextvars.ContextVar("_filled", default=True)
 SMALL = 2**28  # bytes for which nobody asks whether there is room
 BLOCK = 1024  # rows that come from the host at a time: one shape, so one program
+
+
+class Sampling(eqx.Module):
+    """How minibatches are drawn from a buffer."""
+
+    steps: int = eqx.field(static=True, default=1)
+    """n: steps whose rewards a transition sums up, fewer where an episode ends, at least 1: n-step
+    returns (Sutton & Barto 2018, equation 7.1)."""
+    half_life: float | None = None
+    """Age at which a transition is drawn half as often as a new one, above 0, in transitions; None:
+    all are drawn alike."""
+
+    def __check_init__(self):
+        require.at_least("steps", self.steps, 1)
+        if isinstance(self.half_life, int | float) and not self.half_life > 0:
+            raise ValueError(f"half_life is {self.half_life}: it must be above 0, or None")
+
+    def draw(
+        self, replay: "Replay", shape: tuple[int, ...], *, key: PRNGKeyArray
+    ) -> Int[Array, "..."]:
+        """Rows of a buffer, with replacement."""
+        size = jnp.maximum(replay.size, 1)
+        if self.half_life is None:
+            return jax.random.randint(key, shape, 0, size)
+        # The inverse of the distribution function of an exponential that ends at the oldest row.
+        oldest = 1.0 - jnp.exp2(-size.astype(jnp.float32) / self.half_life)
+        age = -self.half_life * jnp.log2(1.0 - jax.random.uniform(key, shape) * oldest)
+        age = jnp.minimum(age.astype(jnp.int32), size - 1)
+        return (replay.position - 1 - age) % replay.capacity
 
 
 class Replay(eqx.Module):
@@ -69,26 +98,52 @@ class Replay(eqx.Module):
         data = jax.tree.map(lambda old, new: old.at[slot].set(new, mode="drop"), self.data, rows)
         return Replay(data, self.written + n)
 
-    def sample(self, n: int, *, together: bool = False, key: PRNGKeyArray) -> Transition:
-        """`n` rows drawn uniformly with replacement. There must be at least one.
+    def sample(
+        self,
+        n: int,
+        sampling: Sampling = Sampling(),
+        gamma: float | Float[Array, ""] = 1.0,
+        *,
+        together: bool = False,
+        key: PRNGKeyArray,
+    ) -> tuple[Transition, Float[Array, "n *agents"] | None]:
+        """`n` transitions with replacement, and `gamma` to the number of steps that each spans;
+        None if that is one. There must be at least one row.
 
         Of a team all leaves get an axis of agents, `[n, agents, ...]`. Each agent has rows of its
         own, as from a buffer of its own, unless they are drawn `together`.
         """
         team = self.data.action.shape[1:-1]
-        index = jax.random.randint(
-            key, (n,) if together else (n, *team), 0, jnp.maximum(self.size, 1)
-        )
-        if team:
-            return self._of_team(index)
-        return jax.tree.map(lambda x: x[index], self.data)
+        index = sampling.draw(self, (n,) if together else (n, *team), key=key)
+        rows = self._rows(index)
+        if sampling.steps == 1:
+            return rows, None
+        discount = jnp.full(rows.terminated.shape, gamma)
+        for step in range(1, sampling.steps):
+            # Episodes lie one behind the other, and behind the newest row there is the oldest.
+            at = (index + step) % self.capacity
+            on = ~(rows.terminated | rows.truncated)
+            on = on & jnp.broadcast_to(at != self.position, on.shape)
+            rows, discount = (
+                rows.followed(self._rows(at), on, discount),
+                jnp.where(on, gamma * discount, discount),
+            )
+        return rows, discount
 
-    def _of_team(self, index: Int[Array, "n *agents"]) -> Transition:
+    def _rows(self, index: Int[Array, "n *agents"]) -> Transition:
         """Each agent's part of its own row; what all share is repeated."""
+        if self.data.action.ndim == 2:
+            return jax.tree.map(lambda x: x[index], self.data)
         n, agents = len(index), self.data.action.shape[1]
         index = jnp.broadcast_to(index.reshape(n, -1), (n, agents))
         every = jnp.arange(agents)
         return jax.tree.map(lambda x: x[index] if x.ndim == 1 else x[index, every], self.data)
+
+    def spread(self, signal: str) -> Float[Array, ""]:
+        """Root mean square of a reward over all rows."""
+        rewards = self.data.rewards[signal]
+        each = jnp.mean(jnp.square(rewards).reshape(self.capacity, -1), axis=1)  # 0 where none is
+        return jnp.sqrt(jnp.sum(each) / jnp.maximum(self.size, 1).astype(jnp.float32))
 
 
 @contextlib.contextmanager

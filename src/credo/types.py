@@ -76,6 +76,28 @@ class Transition(eqx.Module):
     truncated: Bool[Array, "*rows"]  # the clock ran out
     active: Bool[Array, "*rows agents"] | None = None  # whose action counted; None: everybody's
 
+    def followed(self, later: "Transition", where: Any, discount: Any) -> "Transition":
+        """Up to the end of a `later` transition, whose rewards are added with a `discount`, in those
+        rows `where` there is one."""
+        rewards = {
+            name: x + jnp.where(where, discount * later.rewards[name], 0.0)
+            for name, x in self.rewards.items()
+        }
+        ends = [
+            jnp.where(_behind(where, new), new, old)
+            for new, old in (
+                (later.next_obs, self.next_obs),
+                (later.terminated, self.terminated),
+                (later.truncated, self.truncated),
+            )
+        ]
+        return Transition(self.obs, self.action, rewards, *ends, self.active)
+
+
+def _behind(where: Any, x: Any) -> Any:
+    """`where` for `x`, which may have an axis more."""
+    return where.reshape(where.shape + (1,) * (x.ndim - where.ndim))
+
 
 class Batch(eqx.Module):
     """A minibatch for a learner: transitions with the one reward it optimises. Of a team every
@@ -88,6 +110,9 @@ class Batch(eqx.Module):
     terminated: Bool[Array, " batch"]
     truncated: Bool[Array, " batch"]
     active: Bool[Array, "batch agents"] | None = None
+    discount: Float[Array, " batch"] | None = None
+    """γ to the number of steps from `obs` to `next_obs`, whose rewards `reward` sums up discounted;
+    None: it is one step."""
 
 
 class Trace(eqx.Module):

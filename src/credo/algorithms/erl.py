@@ -42,6 +42,7 @@ from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, ddpg
 from ..networks.base import AbstractNetwork
 from ..networks.mlp import MLP, Critic
 from ..networks.team import Team
+from ..replay import Sampling
 from ..rollout import Environment
 from ..types import Metrics
 from .hybrid import Hybrid, HybridState, breed, explore, improve, inject, play, tested
@@ -84,6 +85,7 @@ class ERL(Hybrid):
     workers: int = eqx.field(static=True, default=1)  # b: learners' episodes per generation, ≥ 1
     manager: AbstractManager | None = None  # allocates workers to learners; None: they go in turn
     sync_period: int = eqx.field(static=True, default=10)  # ω: generations between injections, ≥ 1
+    sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     updates_per_frame: float = 1.0  # gradient updates of each learner per frame played, ≥ 0
     warmup_frames: int = eqx.field(static=True, default=1_000)  # frames before learning begins, ≥ 0
     replay_capacity: int = eqx.field(

@@ -23,7 +23,7 @@ from ..learners.base import AbstractLearner, learn
 from ..learners.manager import UCB, AbstractManager, Ledger, even
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..normalization import Moments, behind, frozen, warmed, watched
-from ..replay import Replay, extend
+from ..replay import Replay, Sampling, extend
 from ..rollout import Environment, blank, collect
 from ..types import Evaluation, Metrics
 from .fitness import objective, retested
@@ -66,6 +66,7 @@ class Hybrid(eqx.Module):
     workers: eqx.AbstractVar[int]
     manager: eqx.AbstractVar[AbstractManager | None]
     redistribute: eqx.AbstractVar[bool]
+    sampling: eqx.AbstractVar[Sampling]
     updates_per_frame: eqx.AbstractVar[float]
     warmup_frames: eqx.AbstractVar[int]
     replay_capacity: eqx.AbstractVar[int]
@@ -214,7 +215,8 @@ def improve(hybrid: Hybrid, state: HybridState, frames: Frames, *, key: Key) -> 
     updates = updates.astype(jnp.int32)
     learned, metrics = [], {"updates": updates}
     for i, learner in enumerate(hybrid.learners):
-        given = {"signal": hybrid.reward, "moments": state.seen, "key": jax.random.fold_in(key, i)}
+        given = {"signal": hybrid.reward, "moments": state.seen, "sampling": hybrid.sampling}
+        given["key"] = jax.random.fold_in(key, i)
         after, report = learn(learner, state.learners[i], state.replay, updates, **given)
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}

@@ -39,6 +39,7 @@ from ..learners.base import AbstractLearner
 from ..learners.td3 import TD3, TEAM
 from ..networks.base import AbstractNetwork
 from ..networks.team import Team
+from ..replay import Sampling
 from ..rollout import Environment
 from ..types import Metrics
 from .erl import BREEDER as ERL_BREEDER
@@ -62,6 +63,7 @@ class MERL(Hybrid):
     episodes: int = eqx.field(static=True, default=10)  # ξ: episodes per fitness value, ≥ 1
     workers: int = eqx.field(static=True, default=50)  # learners' episodes per generation, ≥ 1
     migration_period: int = eqx.field(static=True, default=1)  # generations between migrations, ≥ 1
+    sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     updates_per_frame: float = 0.1  # updates of each learner, for all agents, per frame played, ≥ 0
     warmup_frames: int = eqx.field(static=True, default=5_120)  # frames before learning begins, ≥ 0
     replay_capacity: int = eqx.field(static=True, default=100_000)  # transitions in the buffer, ≥ 1

@@ -22,7 +22,7 @@ from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, TEAM, ddpg, maddpg, ma
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.team import Team
 from ..normalization import Moments, behind, frozen, warmed, watched
-from ..replay import Replay, extend
+from ..replay import Replay, Sampling, extend
 from ..rollout import Environment, blank, collect
 from ..types import Metrics
 from .fitness import objective, retested
@@ -50,6 +50,7 @@ class OffPolicy(eqx.Module):
     episodes: int = eqx.field(static=True, default=1)  # episodes between rounds of updates, ≥ 1
     start_frames: int = eqx.field(static=True, default=25_000)  # frames of random actions, ≥ 0
     updates_per_frame: float = 1.0  # gradient updates per environment frame, at least 0
+    sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     redistribute: bool = eqx.field(static=True, default=False)
     """The learner sees each episode's return in equal parts over its frames."""
     test_episodes: int = eqx.field(static=True, default=10)  # episodes of an actor's test, ≥ 1
@@ -161,8 +162,10 @@ class OffPolicy(eqx.Module):
         )
         updates = jnp.where(frames > self.start_frames, total - before, 0.0).astype(jnp.int32)
         reward = objective(self.env, self.learner.signal)
-        given = {"signal": reward, "moments": moments, "key": learn_key}
-        learner, metrics = learn(self.learner, state.learner, replay, updates, **given)
+        given = {"signal": reward, "moments": moments, "sampling": self.sampling}
+        learner, metrics = learn(
+            self.learner, state.learner, replay, updates, **given, key=learn_key
+        )
 
         # Test the actor without noise, now and then.
         actor = frozen(moments, self.learner.actor(learner))

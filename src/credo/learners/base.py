@@ -3,6 +3,7 @@ share."""
 
 import abc
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from ..compilation import jit
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..normalization import Moments, seen
-from ..replay import Replay
+from ..replay import Replay, Sampling
 from ..types import NOTHING, Batch, Metrics
 
 Learned = tuple[PyTree, Metrics]  # state and metrics
@@ -29,6 +30,8 @@ class AbstractLearner(eqx.Module):
 
     signal: eqx.AbstractVar[str | None]  # the reward it optimises; None: the task's first
     batch_size: eqx.AbstractVar[int]  # transitions per update
+    gamma: eqx.AbstractVar[float]  # γ: discount per step
+    reward_scale: eqx.AbstractVar[float | None]  # factor of rewards; None: it follows the buffer
     metrics: eqx.AbstractClassVar[tuple[str, ...]]  # names of what `update` reports
     teams: ClassVar[bool] = False  # whether it learns for all agents of a team
 
@@ -64,7 +67,7 @@ def learn(learner: AbstractLearner, state, replay: Replay, updates, **rest) -> L
     data.
 
     **Arguments:** `signal`: what a learner optimises that names no reward itself. `moments`:
-    what observations are normalised by. `key`.
+    what observations are normalised by. `sampling`: how minibatches are drawn. `key`.
 
     **Returns:** the new state and the mean of each metric; NOTHING if there was no update.
     """
@@ -75,22 +78,50 @@ def learn(learner: AbstractLearner, state, replay: Replay, updates, **rest) -> L
 
 
 @jit
-def _learn(learner, state, replay, updates, *, signal, moments: Moments | None = None, key):
+def _learn(
+    learner,
+    state,
+    replay: Replay,
+    updates,
+    *,
+    signal,
+    moments: Moments | None = None,
+    sampling: Sampling = Sampling(),
+    key,
+):
     dynamic, static = eqx.partition(state, eqx.is_array)
+    signal = learner.signal or signal
+    if learner.reward_scale is None:
+        usual = jnp.maximum(replay.spread(signal), 1e-8)
+        learner = replace(learner, reward_scale=jnp.maximum(1.0 - learner.gamma, 1e-4) / usual)
 
     def body(i, loop):
         dynamic, total = loop
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
-        rows = replay.sample(learner.batch_size, together=learner.together, key=sample_key)
-        reward, ends = rows.rewards[learner.signal or signal], (rows.terminated, rows.truncated)
+        given = (learner.batch_size, sampling, learner.gamma)
+        rows, discount = replay.sample(*given, together=learner.together, key=sample_key)
+        reward, ends = rows.rewards[signal], (rows.terminated, rows.truncated)
         obs, after = seen(moments, rows.obs), seen(moments, rows.next_obs)
-        batch = Batch(obs, rows.action, reward, after, *ends, rows.active)
+        batch = Batch(obs, rows.action, reward, after, *ends, rows.active, discount)
         state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)
         return eqx.filter(state, eqx.is_array), jax.tree.map(jnp.add, total, metrics)
 
     zeros = {name: jnp.float32(0.0) for name in learner.metrics}
     dynamic, total = jax.lax.fori_loop(0, updates, body, (dynamic, zeros))
     return eqx.combine(dynamic, static), averaged(total, updates)
+
+
+def bellman(
+    learner: AbstractLearner,
+    batch: Batch,
+    after: Float[Array, "samples batch *agents"],
+    ended: Bool[Array, "batch *agents"],
+) -> Float[Array, "samples batch *agents"]:
+    """Reward and discounted value of the next state: what returns are worth of which `after` is a
+    sample there, unless the episode `ended`."""
+    reward = (learner.reward_scale * batch.reward)[None]
+    discount = learner.gamma if batch.discount is None else batch.discount[None]
+    return reward + discount * jnp.where(ended[None], 0.0, after)
 
 
 def averaged(total: Metrics, count: Int[Array, ""]) -> Metrics:

@@ -25,11 +25,11 @@ from ..networks.mlp import (
     linear,
 )
 from ..types import Batch, Metrics
-from .base import AbstractLearner, adam, adam_state, descend, polyak
+from .base import AbstractLearner, adam, adam_state, bellman, descend, polyak
 
 Key = PRNGKeyArray
 Scalar = Float[Array, ""]
-Values = Float[Array, " batch"]
+Returns = Float[Array, "samples batch"]
 Critics = tuple[AbstractCriticNetwork, ...]
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # of the authors' code
 
@@ -96,7 +96,8 @@ class SAC(AbstractLearner):
     alpha_lr: float = 3e-4  # learning rate of the temperature's Adam, ≥ 0
     tau: float = 5e-3  # share of the new weights in the target networks per update, in [0, 1]
     target_entropy: float = -1.0  # of the policy, in nats per action dimension
-    reward_scale: float = 1.0  # factor of all rewards that critics see, ≥ 0
+    reward_scale: float | None = 1.0
+    """Factor of all rewards that critics see, ≥ 0; None: as in TD3."""
     critics: int = eqx.field(static=True, default=2)  # number; the target is their minimum, ≥ 1
     batch_size: int = eqx.field(static=True, default=256)  # transitions per update, ≥ 1
     signal: str | None = eqx.field(static=True, default=None)
@@ -148,13 +149,14 @@ class SAC(AbstractLearner):
         state = SACState(actor, critics, targets, log_alpha, actor_opt, critic_opt, alpha_opt)
         return state, {"critic_loss": critic_loss, "actor_loss": actor_loss, "alpha": alpha}
 
-    def soft_target(self, state: SACState, batch: Batch, alpha: Scalar, *, key: Key) -> Values:
-        """y = r + γ (min_i Q'_i(s', a') - α log π(a'|s')), a' drawn from the policy."""
+    def soft_target(self, state: SACState, batch: Batch, alpha: Scalar, *, key: Key) -> Returns:
+        """y = r + γ (min_i Q'_i(s', a') - α log π(a'|s')), a' drawn from the policy; what the
+        critics' `values` say in place of the minimum."""
         obs = batch.next_obs.T
         action, log_p = state.actor.sample(obs, key=key)
-        q = jnp.min(jnp.stack([critic(obs, action) for critic in state.target_critics]), axis=0)
-        reward = self.reward_scale * batch.reward
-        return reward + self.gamma * jnp.where(batch.terminated, 0.0, q - alpha * log_p)
+        atoms = jnp.stack([critic.atoms(obs, action) for critic in state.target_critics])
+        soft = self.critic.values.cautious(atoms) - alpha * log_p[None]
+        return bellman(self, batch, soft, batch.terminated)
 
     def actor(self, state: SACState) -> AbstractPolicy:
         return state.actor.mean
@@ -166,15 +168,17 @@ class SAC(AbstractLearner):
         return eqx.tree_at(lambda s: s.actor.mean, state, actor)
 
 
-def soft_critic_error(critics: Critics, batch: Batch, target: Values) -> tuple[Scalar, None]:
-    """Half the sum over critics of the mean squared Bellman error."""
-    qs = jnp.stack([critic(batch.obs.T, batch.action.T) for critic in critics])
-    return 0.5 * jnp.sum(jnp.mean(jnp.square(qs - target[None]), axis=1)), None
+def soft_critic_error(critics: Critics, batch: Batch, target: Returns) -> tuple[Scalar, None]:
+    """Half the sum over critics of the mean Bellman error, squared unless their `values` say
+    otherwise."""
+    pair = (batch.obs.T, batch.action.T)
+    errors = jnp.stack([one.values.error(one.atoms(*pair), target) for one in critics])
+    return 0.5 * jnp.sum(jnp.mean(errors, axis=1)), None
 
 
 def soft_actor_loss(
     actor: StochasticActor, critics: Critics, batch: Batch, alpha: Scalar, key: Key
-) -> tuple[Scalar, Values]:
+) -> tuple[Scalar, Float[Array, " batch"]]:
     """E[α log π(a|s) - min_i Q_i(s, a)] and log π(a|s), with actions a drawn from the policy.
 
     SAC minimises the first, and needs the second for the temperature.

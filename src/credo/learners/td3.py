@@ -25,6 +25,7 @@ from .base import (
     AbstractLearner,
     act,
     adam_state,
+    bellman,
     descend,
     features_first,
     mean,
@@ -50,7 +51,7 @@ ERL_NETWORK = MLP(hidden=(128, 128), normalization="before", initializer="unifor
 
 Key = PRNGKeyArray
 Critics = tuple[AbstractCriticNetwork, ...]
-Values = Float[Array, "batch *agents"]
+Returns = Float[Array, "samples batch *agents"]
 
 
 class TD3State(eqx.Module):
@@ -87,7 +88,9 @@ class TD3(AbstractLearner):
     actor_scale: float = 1.0  # factor of the weights in the fresh actor's output layer
     bootstrap_truncated: bool = eqx.field(static=True, default=True)
     """A time limit is not the end of the task; False: it counts as one, as in the author's code."""
-    reward_scale: float = 1.0  # factor of all rewards that critics see, ≥ 0
+    reward_scale: float | None = 1.0
+    """Factor of all rewards that critics see, ≥ 0. None: so that the root mean square of all rewards
+    in the buffer, paid at every step, makes a return of 1."""
     batch_size: int = eqx.field(static=True, default=256)  # transitions per update, ≥ 1
     signal: str | None = eqx.field(static=True, default=None)
     """Name of the reward that it maximises; None: that of its algorithm."""
@@ -137,17 +140,16 @@ class TD3(AbstractLearner):
         state = replace(state, critics=critics, critic_opt=critic_opt, **after)
         return state, {"critic_loss": loss, "q": q}
 
-    def bellman_target(self, state: TD3State, batch: Batch, *, key: Key) -> Values:
-        """y = r + γ min_i Q'_i(s', π'(s') + clipped noise)."""
+    def bellman_target(self, state: TD3State, batch: Batch, *, key: Key) -> Returns:
+        """y = r + γ min_i Q'_i(s', π'(s') + clipped noise), or what the critics' `values` say in
+        place of the minimum."""
         noise = self.target_noise * jax.random.normal(key, batch.action.shape)
         noise = jnp.clip(noise, -self.target_noise_clip, self.target_noise_clip)
         action = jnp.clip(act(state.target_actor, batch.next_obs) + noise, -1.0, 1.0)
         pair = (features_first(batch.next_obs), features_first(action))
-        qs = [critic(*pair) for critic in state.target_critics]
-        q = jnp.min(jnp.stack(qs), axis=0)
+        atoms = jnp.stack([critic.atoms(*pair) for critic in state.target_critics])
         ended = batch.terminated | (batch.truncated & (not self.bootstrap_truncated))
-        reward = self.reward_scale * batch.reward
-        return reward + self.gamma * jnp.where(ended, 0.0, q)
+        return bellman(self, batch, self.critic.values.cautious(atoms), ended)
 
     def actor(self, state: TD3State) -> AbstractPolicy:
         return state.actor
@@ -183,12 +185,13 @@ def maddpg(**fields: Any) -> TD3:
     return matd3(**({"critics": 1, "policy_delay": 1, "target_noise": 0.0} | fields))
 
 
-def critic_error(critics: Critics, batch: Batch, target: Values) -> tuple[Array, Array]:
-    """Sum over critics of the mean squared Bellman error, and their mean value."""
+def critic_error(critics: Critics, batch: Batch, target: Returns) -> tuple[Array, Array]:
+    """Sum over critics of the mean Bellman error, squared unless their `values` say otherwise, and
+    their mean value."""
     pair = (features_first(batch.obs), features_first(batch.action))
-    qs = [critic(*pair) for critic in critics]
-    errors = [mean(jnp.square(q - target), batch.active) for q in qs]
-    values = [mean(q, batch.active) for q in qs]
+    atoms = [(critic.values, critic.atoms(*pair)) for critic in critics]
+    errors = [mean(values.error(x, target), batch.active) for values, x in atoms]
+    values = [mean(values.mean(x), batch.active) for values, x in atoms]
     return jnp.sum(jnp.stack(errors)), jnp.mean(jnp.stack(values))
 
 

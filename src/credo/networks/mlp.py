@@ -19,6 +19,7 @@ from .base import (
     matvec,
     to_action,
 )
+from .values import AbstractValues, Mean
 
 NORMALIZATIONS = ("none", "before", "after")
 EPSILON = 1e-6  # of LayerNorm, relative to the variance
@@ -91,6 +92,7 @@ class AbstractCritic(eqx.Module):
 
     joint: ClassVar[bool] = False
     """Whether it sees the whole team; `init` then takes the number of agents behind the sizes."""
+    values: eqx.AbstractVar[AbstractValues]  # what its outputs say of the return
 
     @abc.abstractmethod
     def init(
@@ -103,12 +105,17 @@ class AbstractCriticNetwork(eqx.Module):
     """What `AbstractCritic.init` makes: weights, and how they value state and action."""
 
     action_size: eqx.AbstractVar[int]
+    values: eqx.AbstractVar[AbstractValues]
 
     @abc.abstractmethod
-    def __call__(
+    def atoms(
         self, obs: Float[Array, "obs *batch"], action: Float[Array, "act *batch"]
-    ) -> Float[Array, "*batch"]:
-        """Q(s, a)."""
+    ) -> Float[Array, "atoms *batch"]:
+        """Its outputs, which stand for the return as `values` says."""
+
+    def __call__(self, obs: Array, action: Array) -> Float[Array, "*batch"]:
+        """Q(s, a), of the shapes above."""
+        return self.values.mean(self.atoms(obs, action))
 
     def own(self, obs: Array, action: Array, done: Array) -> Float[Array, "*batch"]:
         """Q(s, a) where each agent does `action` while the rest of its team does what was `done`;
@@ -130,6 +137,7 @@ class Critic(AbstractCritic):
     output_scale: float = eqx.field(static=True, default=1.0)
     """Scale of the fresh output layer's weights, above 0."""
     initializer: str = eqx.field(static=True, default="uniform")  # fresh weights, as in MLP
+    values: AbstractValues = Mean()  # what its outputs say of the return
 
     def __check_init__(self):
         _check(self)
@@ -145,10 +153,10 @@ class Critic(AbstractCritic):
             for (name, fan_in), units, k in zip(fans, self.branches, branch_keys, strict=True):
                 layer = draw_layers((fan_in, units), self.initializer, key=k)
                 weights |= {f"{kind}_{name}": layer[f"{kind}_0"] for kind in "Wb"}
-        sizes = (inputs, *self.hidden, 1)
+        sizes = (inputs, *self.hidden, self.values.atoms)
         weights |= draw_layers(sizes, self.initializer, self.normalization, key=layers_key)
         weights = scaled(weights, len(self.hidden), self.output_scale)
-        return CriticNetwork(weights=weights, config=self, action_size=action_size)
+        return CriticNetwork(weights, self, action_size)
 
 
 class CriticNetwork(AbstractCriticNetwork):
@@ -158,9 +166,11 @@ class CriticNetwork(AbstractCriticNetwork):
     config: Critic = eqx.field(static=True)
     action_size: int = eqx.field(static=True)
 
-    def __call__(
-        self, obs: Float[Array, "obs *batch"], action: Float[Array, "act *batch"]
-    ) -> Float[Array, "*batch"]:
+    @property
+    def values(self) -> AbstractValues:
+        return self.config.values
+
+    def atoms(self, obs, action):
         c = self.config
         if c.branches:
             φ = ACTIVATIONS[c.activation]
@@ -169,7 +179,7 @@ class CriticNetwork(AbstractCriticNetwork):
             )
         x = jnp.concatenate([obs, action])
         x = hidden_layers(self.weights, x, len(c.hidden), c.activation, c.normalization)
-        return linear(self.weights, len(c.hidden), x)[0]
+        return linear(self.weights, len(c.hidden), x)
 
 
 class ResidualCritic(AbstractCritic):
@@ -179,24 +189,26 @@ class ResidualCritic(AbstractCritic):
 
     width: int = eqx.field(static=True, default=256)  # units of every layer, at least 1
     blocks: int = eqx.field(static=True, default=2)  # residual blocks, at least 0
+    values: AbstractValues = Mean()  # what its outputs say of the return
 
     def __check_init__(self):
         require.at_least("width", self.width, 1)
         require.at_least("blocks", self.blocks, 0)
 
     def init(self, obs_size, action_size, *, key):
-        sizes = (obs_size + action_size, *(self.width,) * (1 + 2 * self.blocks), 1)
+        sizes = (obs_size + action_size, *(self.width,) * (1 + 2 * self.blocks), self.values.atoms)
         weights = draw_layers(sizes, "uniform", "before", key=key)
-        return ResidualCriticNetwork(weights=weights, action_size=action_size)
+        return ResidualCriticNetwork(weights, self.values, action_size)
 
 
 class ResidualCriticNetwork(AbstractCriticNetwork):
     """Weights by name as in `MLPPolicy`; of block b the layers 2b + 1 and 2b + 2."""
 
     weights: dict[str, Float[Array, "..."]]
+    values: AbstractValues
     action_size: int = eqx.field(static=True)
 
-    def __call__(self, obs, action):
+    def atoms(self, obs, action):
         def layer(i, x):
             return normalize(self.weights, i, linear(self.weights, i, x))
 
@@ -204,7 +216,7 @@ class ResidualCriticNetwork(AbstractCriticNetwork):
         x = jax.nn.relu(layer(0, jnp.concatenate([obs, action])))
         for i in range(1, last, 2):
             x = x + layer(i + 1, jax.nn.relu(layer(i, x)))
-        return linear(self.weights, last, x)[0]
+        return linear(self.weights, last, x)
 
 
 def draw_layers(

@@ -23,6 +23,7 @@ from .mlp import (
     draw_layers,
     hidden_layers,
 )
+from .values import AbstractValues
 
 UNROLLED = 16  # so many agents are written out one by one; programs grow with their number
 
@@ -197,6 +198,10 @@ class JointCritic(AbstractCritic):
 
     critic: Critic = Critic(hidden=(128, 128))  # the critic of each agent
 
+    @property
+    def values(self) -> AbstractValues:
+        return self.critic.values
+
     def init(self, obs_size, action_size, agents=1, *, key):
         networks = eqx.filter_vmap(
             lambda key: self.critic.init(agents * obs_size, agents * action_size, key=key)
@@ -210,8 +215,14 @@ class JointCriticNetwork(AbstractCriticNetwork):
     networks: CriticNetwork
     action_size: int = eqx.field(static=True)
 
-    def __call__(self, obs, action):
-        return eqx.filter_vmap(lambda q: q(_join(obs), _join(action)))(self.networks).T
+    @property
+    def values(self) -> AbstractValues:
+        return self.networks.values
+
+    def atoms(self, obs, action):
+        together = (_join(obs), _join(action))
+        atoms = eqx.filter_vmap(lambda q: q.atoms(*together))(self.networks)
+        return jnp.moveaxis(atoms, 0, -1)
 
     def own(self, obs, action, done):
         def value(network, agent):
