@@ -75,6 +75,21 @@ def when(due: Any, play: Callable[[], Any], skip: Callable[[], Any]) -> Any:
     return play() if due else skip()
 
 
+def repeat(due: Callable[[Any], Any], step: Callable[[Any], Any], state: Any) -> Any:
+    """`step` as long as `due(state)`; as part of a program only where that is traced (`when`)."""
+    if not isinstance(due(state), jax.core.Tracer):
+        while due(state):
+            state = step(state)
+        return state
+    dynamic, static = eqx.partition(state, eqx.is_array)
+
+    def again(dynamic):
+        return eqx.filter(step(eqx.combine(dynamic, static)), eqx.is_array)
+
+    dynamic = jax.lax.while_loop(lambda x: due(eqx.combine(x, static)), again, dynamic)
+    return eqx.combine(dynamic, static)
+
+
 @functools.cache  # said once
 def enable_cache() -> None:
     """Keep compiled programs in `cache_directory()` between processes."""

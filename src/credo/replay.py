@@ -54,6 +54,9 @@ class Sampling(eqx.Module):
         return (replay.position - 1 - age) % replay.capacity
 
 
+UNIFORM = Sampling()
+
+
 class Replay(eqx.Module):
     """The last `capacity` transitions. Once it is full the oldest is overwritten."""
 
@@ -101,7 +104,7 @@ class Replay(eqx.Module):
     def sample(
         self,
         n: int,
-        sampling: Sampling = Sampling(),
+        sampling: Sampling = UNIFORM,
         gamma: float | Float[Array, ""] = 1.0,
         *,
         together: bool = False,

@@ -38,6 +38,7 @@ from ..evolution.breeder import Breeder, evolving, overridden
 from ..evolution.mutation import MatrixMutation
 from ..learners.base import AbstractLearner
 from ..learners.manager import UCB, AbstractManager
+from ..learners.share import AbstractShare
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, ddpg
 from ..networks.base import AbstractNetwork
 from ..networks.mlp import MLP, Critic
@@ -45,7 +46,7 @@ from ..networks.team import Team
 from ..replay import Sampling
 from ..rollout import Environment
 from ..types import Metrics
-from .hybrid import Hybrid, HybridState, breed, explore, improve, inject, play, tested
+from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
 
 TABLE_5_1 = {  # task: (ψ, ξ, ω)
     "HalfCheetah": (0.1, 1, 10),
@@ -84,6 +85,9 @@ class ERL(Hybrid):
     """Learners see each episode's return in equal parts over its frames, however late it came."""
     workers: int = eqx.field(static=True, default=1)  # b: learners' episodes per generation, ≥ 1
     manager: AbstractManager | None = None  # allocates workers to learners; None: they go in turn
+    share: AbstractShare | None = None
+    """What part of all frames the learners play, in rounds of `workers` episodes that are each
+    learned from; None: one round per generation."""
     sync_period: int = eqx.field(static=True, default=10)  # ω: generations between injections, ≥ 1
     sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     updates_per_frame: float = 1.0  # gradient updates of each learner per frame played, ≥ 0
@@ -154,17 +158,18 @@ class ERL(Hybrid):
         state, played = play(self, state, state.population, self.episodes, key=play_key)
         fitness = average = jnp.mean(played.of(self.reward), axis=1)
 
+        state = balance(self, state, fitness)
+
         # 8-15: rank, keep the elites, select, cross and mutate.
         if self.remember:
             lineage, average = state.lineage.averaged(fitness)
             state = replace(state, lineage=lineage)
         state, bred = breed(self, state, average, key=breed_key)
 
-        # 16-20: learners play too, with noise; their mean return is their value.
-        state, explored = explore(self, state, jnp.sum(played.steps), key=explore_key)
-
-        # 21-29: as many updates as frames, each learner on minibatches of its own.
-        state, learned = improve(self, state, explored["frames"], key=learn_key)
+        # 16-29: learners play too, with noise, and their mean return is their value; then as many
+        # updates as frames, each learner on minibatches of its own.
+        frames, keys = jnp.sum(played.steps), (explore_key, learn_key)
+        state, learned = teach(self, state, frames, keys=keys)
 
         # 30-33: allocate the workers of the next generation.
         if self.manager is not None and self.learners:
@@ -175,4 +180,4 @@ class ERL(Hybrid):
         due = (state.generation % self.sync_period == 0) & (learned["updates"] > 0)
         state = inject(self, state, due)
 
-        return tested(self, state, fitness, bred | explored | learned, key=test_key)
+        return tested(self, state, fitness, bred | learned, key=test_key)

@@ -16,11 +16,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
-from ..compilation import float32, jit
+from ..compilation import float32, jit, repeat
 from ..evolution.breeder import Breeder, draw
 from ..evolution.selection import rankable, ranking
 from ..learners.base import AbstractLearner, learn
 from ..learners.manager import UCB, AbstractManager, Ledger, even
+from ..learners.share import AbstractShare
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..normalization import Moments, behind, frozen, warmed, watched
 from ..replay import Replay, Sampling, extend
@@ -49,6 +50,7 @@ class HybridState(eqx.Module):
     seen: Moments | None  # the same with what was seen in this generation, in the midst of one
     score: Float[Array, ""] = _field(-jnp.inf, jnp.float32)
     """Of the champion that was tested last; -inf: none was."""
+    share: Float[Array, ""] = _field(0.0, jnp.float32)  # of the frames that the learners get
     frames: Int[Array, ""] = _field(0, jnp.int32)
     episodes: Int[Array, ""] = _field(0, jnp.int32)
     generation: Int[Array, ""] = _field(0, jnp.int32)
@@ -65,6 +67,7 @@ class Hybrid(eqx.Module):
     episodes: eqx.AbstractVar[int]
     workers: eqx.AbstractVar[int]
     manager: eqx.AbstractVar[AbstractManager | None]
+    share: eqx.AbstractVar[AbstractShare | None]
     redistribute: eqx.AbstractVar[bool]
     sampling: eqx.AbstractVar[Sampling]
     updates_per_frame: eqx.AbstractVar[float]
@@ -109,7 +112,10 @@ class Hybrid(eqx.Module):
     @property
     def most_frames(self) -> int:
         """Frames of one generation, if every episode lasts until the time limit."""
-        return self.rounds * self.env.max_steps
+        rounds = self.rounds
+        if self.share is not None and self.learners:  # the last round may begin just before the end
+            rounds += int(self.population_size * self.episodes / (1.0 - self.share.most))
+        return rounds * self.env.max_steps
 
     @float32()
     def init(self, *, key: PRNGKeyArray) -> HybridState:
@@ -130,6 +136,7 @@ class Hybrid(eqx.Module):
             champion=frozen(moments, tree.take(population, 0)),
             moments=moments,
             seen=moments,
+            share=jnp.float32(self.share.first() if self.share else 0.0),
         )
 
     def warm(self, state: HybridState, policy: AbstractPolicy) -> HybridState:
@@ -207,9 +214,49 @@ def explore(hybrid: Hybrid, state: HybridState, frames: Frames, *, key: Key) -> 
     return state, {"frames": frames} | metrics
 
 
-def improve(hybrid: Hybrid, state: HybridState, frames: Frames, *, key: Key) -> Result:
-    """Each learner makes `updates_per_frame` updates for each of the generation's `frames`, on
-    minibatches of its own from the common buffer. The state counts the generation's frames."""
+def balance(hybrid: Hybrid, state: HybridState, fitness: Fitness) -> HybridState:
+    """With the share of frames that learners get in this generation."""
+    if hybrid.share is None or not hybrid.learners:
+        return state
+    guests = state.lineage.guest >= 0
+    return replace(state, share=hybrid.share.after(state.share, rankable(fitness), guests))
+
+
+def teach(hybrid: Hybrid, state: HybridState, frames: Frames, *, keys: tuple[Key, Key]) -> Result:
+    """The learners play and improve, in rounds, until they have had their share of all frames
+    beside the population's `frames`; without shares one round."""
+    explore_key, learn_key = keys
+    wanted = state.share / (1.0 - state.share) * frames.astype(jnp.float32)
+    state, explored = explore(hybrid, state, frames, key=explore_key)
+    theirs = explored["frames"] - frames
+    state, learned = improve(hybrid, state, explored["frames"], hybrid.rounds, key=learn_key)
+    metrics = explored | learned
+    if hybrid.share is None or not hybrid.learners:
+        return state, metrics
+
+    def due(loop) -> Bool[Array, ""]:
+        return loop[1].astype(jnp.float32) < wanted
+
+    def again(loop):
+        state, theirs, metrics, turn = loop
+        fresh = [jax.random.fold_in(key, len(hybrid.learners) + turn) for key in keys]
+        state, explored = explore(hybrid, state, jnp.int32(0), key=fresh[0])
+        new = explored["frames"]
+        state, learned = improve(hybrid, state, new, hybrid.workers, key=fresh[1])
+        summed = {
+            name: metrics[name] + (explored | learned)[name] for name in ("frames", "updates")
+        }
+        return state, theirs + new, metrics | explored | learned | summed, turn + 1
+
+    state, _, metrics, turns = repeat(due, again, (state, theirs, metrics, jnp.int32(0)))
+    return state, metrics | {"learner_share": state.share, "learner_rounds": turns + 1}
+
+
+def improve(
+    hybrid: Hybrid, state: HybridState, frames: Frames, episodes: int, *, key: Key
+) -> Result:
+    """Each learner makes `updates_per_frame` updates for each of some new `frames`, on minibatches
+    of its own from the common buffer. The state counts these frames, and their `episodes`."""
     ready = (state.frames >= hybrid.warmup_frames) & bool(hybrid.learners)
     updates = jnp.where(ready, frames.astype(jnp.float32) * hybrid.updates_per_frame, 0.0)
     updates = updates.astype(jnp.int32)
@@ -221,7 +268,7 @@ def improve(hybrid: Hybrid, state: HybridState, frames: Frames, *, key: Key) -> 
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}
     state = replace(state, learners=tuple(learned), moments=state.seen)
-    counted = {"frames": state.frames + frames, "episodes": state.episodes + hybrid.rounds}
+    counted = {"frames": state.frames + frames, "episodes": state.episodes + episodes}
     return replace(state, **counted), metrics
 
 

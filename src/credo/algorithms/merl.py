@@ -36,6 +36,7 @@ from .. import require
 from ..compilation import float32
 from ..evolution.breeder import Breeder, evolving
 from ..learners.base import AbstractLearner
+from ..learners.share import AbstractShare
 from ..learners.td3 import TD3, TEAM
 from ..networks.base import AbstractNetwork
 from ..networks.team import Team
@@ -43,7 +44,7 @@ from ..replay import Sampling
 from ..rollout import Environment
 from ..types import Metrics
 from .erl import BREEDER as ERL_BREEDER
-from .hybrid import Hybrid, HybridState, breed, explore, improve, inject, play, tested
+from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
 
 LOCAL = TD3(signal="local", **TEAM)
 """The learner of the team: one twin critic that all agents share (lines 2 and 16-21)."""
@@ -62,6 +63,9 @@ class MERL(Hybrid):
     breeder: Breeder = BREEDER  # how the next population is made
     episodes: int = eqx.field(static=True, default=10)  # ξ: episodes per fitness value, ≥ 1
     workers: int = eqx.field(static=True, default=50)  # learners' episodes per generation, ≥ 1
+    share: AbstractShare | None = None
+    """What part of all frames the learners play, in rounds of `workers` episodes that are each
+    learned from; None: one round per generation."""
     migration_period: int = eqx.field(static=True, default=1)  # generations between migrations, ≥ 1
     sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     updates_per_frame: float = 0.1  # updates of each learner, for all agents, per frame played, ≥ 0
@@ -102,18 +106,19 @@ class MERL(Hybrid):
         state, played = play(self, state, state.population, self.episodes, key=rollout_key)
         fitness = jnp.mean(played.of(self.reward), axis=1)
 
+        state = balance(self, state, fitness)
+
         # 10-14: rank, keep e elites, select k-e by tournament, cross with elites; and mutate.
         state, bred = breed(self, state, fitness, key=breed_key)
 
         # 8: Rollout(π_pg, R, noise=W_g, ξ=1), in parallel worlds.
-        state, explored = explore(self, state, jnp.sum(played.steps), key=explore_key)
-
         # 15-21: for agent k: a minibatch from R^k; descend the critic's loss; follow the gradient
         # of Q with head k; move the targets.
-        state, learned = improve(self, state, explored["frames"], key=learn_key)
+        frames, keys = jnp.sum(played.steps), (explore_key, learn_key)
+        state, learned = teach(self, state, frames, keys=keys)
 
         # 22: Migrate: the weakest teams become copies of π_pg.
         due = (state.generation % self.migration_period == 0) & (learned["updates"] > 0)
         state = inject(self, state, due)
 
-        return tested(self, state, fitness, bred | explored | learned, key=test_key)
+        return tested(self, state, fitness, bred | learned, key=test_key)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from ..compilation import jit
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..normalization import Moments, seen
-from ..replay import Replay, Sampling
+from ..replay import UNIFORM, Replay, Sampling
 from ..types import NOTHING, Batch, Metrics
 
 Learned = tuple[PyTree, Metrics]  # state and metrics
@@ -62,7 +62,9 @@ class AbstractLearner(eqx.Module):
         """`state` that goes on from a given actor."""
 
 
-def learn(learner: AbstractLearner, state, replay: Replay, updates, **rest) -> Learned:
+def learn(
+    learner: AbstractLearner, state, replay: Replay, updates, sampling: Sampling = UNIFORM, **rest
+) -> Learned:
     """`updates` gradient steps, each on a minibatch of its own, in one program. Their number is
     data.
 
@@ -74,7 +76,7 @@ def learn(learner: AbstractLearner, state, replay: Replay, updates, **rest) -> L
     if not isinstance(updates, jax.core.Tracer) and updates == 0:
         # Nothing need be compiled for it: the first fitness of a run comes sooner.
         return state, {name: jnp.float32(NOTHING) for name in learner.metrics}
-    return _learn(learner, state, replay, updates, **rest)
+    return _learn(learner, state, replay, updates, sampling=sampling, **rest)
 
 
 @jit
@@ -86,7 +88,7 @@ def _learn(
     *,
     signal,
     moments: Moments | None = None,
-    sampling: Sampling = Sampling(),
+    sampling: Sampling,
     key,
 ):
     dynamic, static = eqx.partition(state, eqx.is_array)

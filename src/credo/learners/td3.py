@@ -89,8 +89,8 @@ class TD3(AbstractLearner):
     bootstrap_truncated: bool = eqx.field(static=True, default=True)
     """A time limit is not the end of the task; False: it counts as one, as in the author's code."""
     reward_scale: float | None = 1.0
-    """Factor of all rewards that critics see, ≥ 0. None: so that the root mean square of all rewards
-    in the buffer, paid at every step, makes a return of 1."""
+    """Factor of all rewards that critics see, ≥ 0. None: so that the root mean square of the
+    buffer's rewards, paid at every step, makes a return of 1."""
     batch_size: int = eqx.field(static=True, default=256)  # transitions per update, ≥ 1
     signal: str | None = eqx.field(static=True, default=None)
     """Name of the reward that it maximises; None: that of its algorithm."""
