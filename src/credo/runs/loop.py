@@ -403,8 +403,7 @@ class _Training:
             self.save()
             return "budget"
         self.require_sound()
-        self.bar.say_memory(_buffers(self.state))
-        self.bar.start()
+        self.bar.start(_buffers(self.state))
         try:
             while not (self.reached or self.ended or signals.received):
                 self.dispatch()
@@ -482,7 +481,7 @@ class _Training:
         path, generation, sealed = self.run.path, self.generation, seal(self.run.config)
         seals: dict[str, Any] = {"record": sealed}
         if generation > 0:
-            seals["metrics"] = log.seal(path, generation)
+            seals["metrics"] = self.journal.seal()
         checkpoint.save(
             path / "checkpoints",
             generation,
