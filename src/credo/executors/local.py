@@ -80,16 +80,12 @@ class Job:
     def budget(self) -> Budget:
         """What the run is to reach."""
         if self.again is not None:
-            return Budget.read(record.read(self.path)["budget"]).going_on(self._kind, self.options)
-        return Budget.of(self._kind, self.options)
-
-    @property
-    def _kind(self) -> Any:
-        """Who knows the default budget."""
-        asked = (self.options.generations, self.options.frames) != (None, None)
-        if asked or not isinstance(self.algorithm, dict) or self.again is not None:
-            return self.algorithm
-        return config.find_class(self.algorithm["class"])
+            old = Budget(**record.read(self.path)["budget"])
+            return Budget.of(self.algorithm, self.options, old)
+        kind, asked = self.algorithm, (self.options.generations, self.options.frames)
+        if isinstance(kind, dict) and asked == (None, None):
+            kind = config.find_class(kind["class"])  # which knows its default budget
+        return Budget.of(kind, self.options)
 
     def finished(self) -> bool:
         """Whether the champion on disk is the budget's. Raises `RunError` if the folder holds
@@ -107,7 +103,7 @@ class Job:
         done = int(row["generation"]), int(row["frames"])
         if self.again is not None:
             try:
-                self.budget.refuse_smaller(Budget.read(run.config["budget"]), *done)
+                self.budget.refuse_smaller(Budget(**run.config["budget"]), *done)
             except ValueError as error:
                 raise RunError(f"{self.path}: {error}") from None
         return self.budget.reached(*done, float(row["champion_score"])) is not None
@@ -115,7 +111,7 @@ class Job:
     def _require_same(self, run: Run) -> None:
         """Raise if the folder holds a run that this job is not."""
         lines = config.changed(run.config["algorithm"], self.tree)
-        recorded = Budget.read(run.config["budget"])
+        recorded = Budget(**run.config["budget"])
         for name in ("generations", "frames"):
             old, new = getattr(recorded, name), getattr(self.budget, name)
             if old is not None and (new is None or old > new):
@@ -136,7 +132,7 @@ class Job:
         )
         options = self.options
         if self.again is None:
-            options = options.changed(self.budget.record())
+            options = options.changed(dataclasses.asdict(self.budget))
         told = {"path": str(self.path), "algorithm": self.tree, "seed": self.seed}
         told |= {"warm_start": self.warm_start, "options": options.record(), "again": again}
         return json.dumps(told)
@@ -213,7 +209,7 @@ class _Crew:
         cores, asked = config.available_cores(), None
         try:
             with self.signals:
-                self.line.start()
+                self.line.start(self.told())
                 for i in range(number):
                     self.give(_start(cores[i % len(cores)]), cores[i % len(cores)])
                 while self.under_way:

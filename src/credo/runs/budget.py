@@ -23,29 +23,15 @@ class Budget:
             raise ValueError("a run needs a budget: give generations, frames or both")
 
     @classmethod
-    def of(cls, algorithm: Any, options: RunOptions) -> "Budget":
-        """As the options say, or else the `default_budget` of the algorithm, an object or a
-        class."""
-        if options.generations is None and options.frames is None:
-            limits = getattr(algorithm, "default_budget", DEFAULT)
-            return cls(**limits, stop_at=options.stop_at)
-        return cls(options.generations, options.frames, options.stop_at)
-
-    def going_on(self, algorithm: Any, options: RunOptions) -> "Budget":
-        """The budget of a run with this one that is resumed with these options."""
+    def of(cls, algorithm: Any, options: RunOptions, old: "Budget | None" = None) -> "Budget":
+        """As the options say; or else `old`, that of a run which goes on, or the `default_budget`
+        of the algorithm, an object or a class."""
         if options.generations is not None or options.frames is not None:
-            return Budget.of(algorithm, options)
-        return (
-            self if options.stop_at is None else dataclasses.replace(self, stop_at=options.stop_at)
-        )
-
-    @classmethod
-    def read(cls, record: dict[str, Any]) -> "Budget":
-        """As recorded in a config; those of older versions know no frames."""
-        return cls(**record)
-
-    def record(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)
+            return cls(options.generations, options.frames, options.stop_at)
+        budget = old or cls(**getattr(algorithm, "default_budget", DEFAULT))
+        if options.stop_at is None:
+            return budget
+        return dataclasses.replace(budget, stop_at=options.stop_at)
 
     @property
     def stop_score(self) -> np.float32:
@@ -77,11 +63,7 @@ class Budget:
 
     def share(self, generation: int, frames: int) -> float:
         """How far a run is, from 0 to 1."""
-        shares = [
-            done / limit
-            for done, limit in ((generation, self.generations), (frames, self.frames))
-            if limit is not None
-        ]
+        shares = generation / (self.generations or np.inf), frames / (self.frames or np.inf)
         return min(1.0, max(shares))
 
     def refuse_smaller(self, old: "Budget", generation: int, frames: int) -> None:
@@ -116,13 +98,6 @@ def fitted(algorithm: Any, budget: Budget) -> Any:
     # Budgets of about the same size share their programs.
     rows = min(capacity, 1 << (max(1, min(bounds)) - 1).bit_length())
     return dataclasses.replace(algorithm, replay_capacity=rows)
-
-
-def fitted_as(algorithm: Any, other: Any) -> Any:
-    """`algorithm` with the replay buffer of `other`, if they have one."""
-    if not hasattr(other, "replay_capacity"):
-        return algorithm
-    return dataclasses.replace(algorithm, replay_capacity=other.replay_capacity)
 
 
 def short(number: float) -> str:

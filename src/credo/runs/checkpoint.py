@@ -124,7 +124,7 @@ def save(
         _remove_unfinished(directory)
         if not folder.exists() or damage(folder, reread=False):
             _write_folder(folder, _chunks(header, leaves), text, parts, there, seals)
-        elif (commit := _commit(folder)).get("seals", {}) != seals:
+        elif (commit := _commit(folder))["seals"] != seals:
             text = _commit_text(generation, commit["files"], seals)
             files.write_whole(folder / COMMIT, [text])
     _remove_beyond(keep, folder)
@@ -169,7 +169,7 @@ def load(
     for folder in folders:
         reason = damage(folder, replay=not without_replay)
         if reason is None and check is not None:
-            reason = check(int(folder.name), _commit(folder).get("seals", {}))
+            reason = check(int(folder.name), _commit(folder)["seals"])
         if reason is None:
             _warn_of(damaged, folder, without_replay)
             return _loaded(folder, like, extra, without_replay)
@@ -201,13 +201,13 @@ def _loaded(folder: Path, like: PyTree, extra: PyTree, without_replay: bool) -> 
     more = {name: arrays.pop(name) for name in list(arrays) if name.startswith(EXTRA)}
     empty = segments.names(like) if without_replay else set()
     with _explained(f"cannot read {folder}", folder):
-        arrays |= segments.stored(folder, metadata.get(REPLAY, "[]"))
+        commit = _commit(folder)
+        arrays |= segments.stored(folder, commit["files"], metadata.get(REPLAY, "[]"))
         state = _fit(folder / STATE, like, arrays, metadata, empty)
         more = {name.removeprefix(EXTRA): array for name, array in more.items()}
         extra = _fit(folder / STATE, extra, more, metadata) if more and extra is not None else None
         counters = json.loads(files.read_bytes(folder / COUNTERS))
-        seals = _commit(folder).get("seals", {})
-    return Checkpoint(int(folder.name), state, counters, folder, seals, extra)
+    return Checkpoint(int(folder.name), state, counters, folder, commit["seals"], extra)
 
 
 def damage(folder: Path, *, reread: bool = True, replay: bool = True) -> str | None:
@@ -217,28 +217,29 @@ def damage(folder: Path, *, reread: bool = True, replay: bool = True) -> str | N
     be as they were if their file was not touched since; without `replay` they are not looked at.
     """
     try:
-        names = set(os.listdir(folder))
+        names = os.listdir(folder)
         if not names:
             return "the folder is empty"
         if COMMIT not in names:
             return f"it has no {COMMIT}: writing it was never finished"
-        if missing := {STATE, COUNTERS} - names:
-            return f"{' and '.join(sorted(missing))} is missing"
-        committed = files.read_bytes(folder / COMMIT)
-        commit = _parsed(committed)
-        found = {name: _looked_at(folder / name, commit) for name in (STATE, COUNTERS)}
-        if not replay:
-            names = set()
-            found |= {
-                name: f for name, f in commit["files"].items() if segments.NAME.fullmatch(name)
-            }
-        for name in filter(segments.NAME.fullmatch, names):
-            found[name] = _looked_at(folder / name, commit, reread=reread)
+        then = _commit(folder)["files"]
+        looked_at = [name for name in then if replay or not segments.NAME.fullmatch(name)]
+        if missing := sorted(set(looked_at).difference(names)):
+            return f"{' and '.join(missing)} is missing"
+        differing = (_differs(folder / name, then[name], reread) for name in looked_at)
+        return next(filter(None, differing), None)
+    except CheckpointError as error:
+        return str(error)
     except (OSError, ValueError) as error:
         return f"it cannot be read: {error}"
-    if committed == _commit_text(int(folder.name), found, commit["seals"]):
-        return None
-    return _difference(commit["files"], found)
+
+
+def seals_of(folder: Path) -> dict[str, Any]:
+    """The seals of the checkpoint in `folder`; none if they cannot be read."""
+    try:
+        return _commit(folder)["seals"]
+    except (OSError, ValueError, CheckpointError):
+        return {}
 
 
 def export_policy(path: Path, tree: PyTree, metadata: Mapping[str, str] | None = None) -> None:
@@ -529,7 +530,7 @@ def _write_folder(
         for name, rows in parts.items():
             if not (name in there and _link(there[name], partial / name)):
                 _write_part(partial / name, rows)
-            found[name] = _part_fingerprint(partial / name, reread=False)
+            found[name] = _known_fingerprint(partial / name, reread=False)
         _write(partial / COMMIT, [_commit_text(int(folder.name), found, seals)])
         files.sync(partial)
         if os.path.lexists(folder):
@@ -551,7 +552,7 @@ def _identity(path: Path) -> tuple[int, ...]:
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def _part_fingerprint(path: Path, *, reread: bool) -> dict[str, Any]:
+def _known_fingerprint(path: Path, *, reread: bool) -> dict[str, Any]:
     identity = _identity(path)
     if reread or identity not in _seen:
         _seen[identity] = _fingerprint(path)
@@ -612,9 +613,9 @@ def _intact_parts(directory: Path, names: Iterable[str], but: Path | None) -> di
                 path = folder / name
                 if _identity(path)[:2] in taken:
                     continue
-                if _part_fingerprint(path, reread=False) == written[name]:
+                if _known_fingerprint(path, reread=False) == written[name]:
                     there[name] = path
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, CheckpointError):
             continue  # damaged: what only it has is written again
     return there
 
@@ -645,55 +646,38 @@ def _fingerprint(path: Path) -> dict[str, Any]:
         return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), "bytes": file.tell()}
 
 
-def _looked_at(path: Path, commit: Mapping[str, Any], *, reread: bool = True) -> dict[str, Any]:
-    """The fingerprint of a file; of one that has another size than it should, only that."""
+def _differs(path: Path, then: Mapping[str, Any], reread: bool) -> str | None:
+    """How a file differs from what COMMIT says of it."""
     size = os.stat(path).st_size
-    should = commit["files"].get(path.name)
-    if should is not None and size != should["bytes"]:
-        return {"sha256": None, "bytes": size}
-    part = segments.NAME.fullmatch(path.name)
-    return _part_fingerprint(path, reread=reread) if part else _fingerprint(path)
+    if size != then["bytes"]:
+        return f"{path.name} has {size} bytes, {COMMIT} says {then['bytes']}"
+    reread = reread or not segments.NAME.fullmatch(path.name)
+    if _known_fingerprint(path, reread=reread) != then:
+        return f"the SHA-256 of {path.name} is not the one in {COMMIT}"
+    return None
 
 
 def _commit(folder: Path) -> dict[str, Any]:
-    """What COMMIT says. Raises `OSError` and `ValueError`."""
-    return _parsed(files.read_bytes(folder / COMMIT))
+    """The files and seals that COMMIT names. Raises `OSError`, `ValueError` if it is too large, and
+    `CheckpointError` if it is not as it was written."""
+    committed = files.read_bytes(folder / COMMIT)
+    with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        said = json.loads(committed)
+        found, seals = said["files"], dict(said.get("seals", {}))
+        whole = {STATE, COUNTERS} <= found.keys() and all(
+            f.keys() == {"bytes", "sha256"} for f in found.values()
+        )
+        if whole and committed == _commit_text(int(folder.name), found, seals):
+            return {"files": found, "seals": seals}
+    raise CheckpointError(f"{COMMIT} is not as it was written")
 
 
-def _parsed(committed: bytes) -> dict[str, Any]:
-    """The same of its text, `seals` and all; of no files if it does not say as we do."""
-    try:
-        commit = json.loads(committed)
-        found = {
-            str(name): {k: f[k] for k in ("bytes", "sha256")} for name, f in commit["files"].items()
-        }
-        return {"files": found, "seals": dict(commit.get("seals", {}))}
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return {"files": {}, "seals": {}}
-
-
-def _commit_text(
-    generation: int, files: Mapping[str, dict[str, Any]], seals: Mapping[str, Any] = {}
-) -> bytes:
+def _commit_text(generation: int, files: Mapping[str, Any], seals: Mapping[str, Any] = {}) -> bytes:
     commit: dict[str, Any] = {"generation": generation, "files": files}
     if seals:
         text = json.dumps(seals, sort_keys=True)
         commit |= {"seals": seals, "sha256 of seals": hashlib.sha256(text.encode()).hexdigest()}
     return json.dumps(commit, indent=2, sort_keys=True).encode()
-
-
-def _difference(then: Mapping[str, Any], found: Mapping[str, dict[str, Any]]) -> str:
-    """Which file is not as COMMIT says."""
-    if missing := set(then).difference(found):
-        return f"{' and '.join(sorted(missing))} is missing"
-    for name, now in found.items() if then else ():
-        if name not in then:
-            break
-        if now["bytes"] != then[name]["bytes"]:
-            return f"{name} has {now['bytes']} bytes, {COMMIT} says {then[name]['bytes']}"
-        if now["sha256"] != then[name]["sha256"]:
-            return f"the SHA-256 of {name} is not the one in {COMMIT}"
-    return f"{COMMIT} is not as it was written"
 
 
 @contextlib.contextmanager

@@ -38,7 +38,6 @@ from ..networks.base import AbstractNetwork
 from ..networks.exploration import AbstractNoise
 from ..networks.mlp import AbstractCritic
 from ..require import suggestion
-from . import files
 
 EXTENSIONS = (
     AbstractEnvironment,
@@ -341,11 +340,6 @@ def _processor() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine()
-
-
-def write_json(path: pathlib.Path, value: Any) -> None:
-    """Write a file that is either the old one or the whole new one."""
-    files.write_json(path, value)
 
 
 def flatten(tree: Any, path: str = "") -> dict[str, Any]:

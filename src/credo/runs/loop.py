@@ -29,10 +29,10 @@ from .. import compilation
 from ..compilation import jit
 from ..environments import processes
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
-from ..replay import Replay, shapes_alone
+from ..replay import shapes_alone
 from ..types import NOTHING
-from . import callbacks, checkpoint, config, files, log, record, screen, weights
-from .budget import Budget, fitted, fitted_as
+from . import callbacks, checkpoint, config, files, log, record, screen, segments, weights
+from .budget import Budget, fitted
 from .folder import free_name, new_folder
 from .lock import lock
 from .options import RunOptions
@@ -112,7 +112,7 @@ def train(
     source = None if warm_start is None else Run(warm_start)
     path = pathlib.Path(path) if path else free_name(algorithm, seed)
     with new_folder(path):
-        fit = fitted(algorithm, Budget.read(said["budget"]))
+        fit = fitted(algorithm, Budget(**said["budget"]))
         _begin(path, said, fit, source)
         run = Run(path, trust=True)
         return _train(run, fit, _load(run, fit), options, heard)
@@ -169,7 +169,10 @@ def _said(
     tree = config.to_tree(algorithm)
     config.from_tree(tree)  # what cannot be read back should fail now, not at a resume
     said: dict[str, Any] = {"algorithm": tree, "seed": seed, "options": options.record()}
-    said |= {"budget": Budget.of(algorithm, options).record(), "machine": config.machine()}
+    said |= {
+        "budget": dataclasses.asdict(Budget.of(algorithm, options)),
+        "machine": config.machine(),
+    }
     if warm_start is not None:
         said["warm_start"] = str(warm_start)
     if prompt := config.of_a_prompt(tree):
@@ -267,16 +270,14 @@ def _reopened(
 ) -> tuple[Any, checkpoint.Checkpoint]:
     """The algorithm with its new settings, and the checkpoint to go on from. What is changed is put
     into the record, which is not written yet."""
-    algorithm, old = run.algorithm, Budget.read(run.config["budget"])
-    budget = old.going_on(algorithm, options)
+    algorithm, old = run.algorithm, Budget(**run.config["budget"])
+    budget = Budget.of(algorithm, options, old)
     # A smaller budget is refused, but only once it is known how far the run is. A setting may make
     # generations longer: the buffer must hold what either plays.
-    either = (algorithm, config.replaced(algorithm, settings))
-    fit = max(
-        (fitted(one, limit) for one in either for limit in (old, budget)),
-        key=lambda one: getattr(one, "replay_capacity", 0),
-    )
-    fit = fitted_as(algorithm, fit)
+    either, fit = (algorithm, config.replaced(algorithm, settings)), algorithm
+    if hasattr(algorithm, "replay_capacity"):
+        rows = [fitted(one, limit).replay_capacity for one in either for limit in (old, budget)]
+        fit = dataclasses.replace(algorithm, replay_capacity=max(rows))
     with run.found():
         record.check_task(run.config, algorithm.env)
         saved = _load(run, fit, without_replay)
@@ -292,8 +293,8 @@ def _reopened(
     if any(name.startswith("env.") for change in later for name in change.get("set", {})):
         saved = dataclasses.replace(saved, extra=None)  # its score is of another task
     if budget != old:
-        _note(run, saved.generation, budget=old.record())
-        run.config["budget"] = budget.record()
+        _note(run, saved.generation, budget=dataclasses.asdict(old))
+        run.config["budget"] = dataclasses.asdict(budget)
     return fit, saved
 
 
@@ -377,10 +378,8 @@ class _Training:
         heard: list[callbacks.Callback],
     ):
         self.run, self.algorithm, self.options = run, algorithm, options
-        self.root, self.budget = (
-            jax.random.key(run.config["seed"]),
-            Budget.read(run.config["budget"]),
-        )
+        self.root = jax.random.key(run.config["seed"])
+        self.budget = Budget(**run.config["budget"])
         self.generation, self.frames = saved.generation, int(saved.counters["frames"])
         self.safe, self.chunk = saved.generation, 1
         self.journal = log.Log(run.path, self.generation)
@@ -403,7 +402,7 @@ class _Training:
             self.save()
             return "budget"
         self.require_sound()
-        self.bar.start(_buffers(self.state))
+        self.bar.start([buffer for _, buffer in segments.buffers(self.state)])
         try:
             while not (self.reached or self.ended or signals.received):
                 self.dispatch()
@@ -581,8 +580,3 @@ def advance(fixed: tuple[Any, ...], state: PyTree, best: Best):
     start = (jnp.int32(0), left, dynamic, best, jnp.float32(-jnp.inf), empty)
     count, _, dynamic, best, _, kept = jax.lax.while_loop(ongoing, body, start)
     return eqx.combine(dynamic, static), best, count, kept
-
-
-def _buffers(state: PyTree) -> list[Replay]:
-    leaves = jax.tree.leaves(state, is_leaf=lambda x: isinstance(x, Replay))
-    return [leaf for leaf in leaves if isinstance(leaf, Replay)]

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
 from ..replay import Replay
@@ -26,14 +26,18 @@ class Line:
             TextColumn("{task.description}"),
             BarColumn(bar_width=10),
             TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(),
             console=self.console,
-            auto_refresh=False,
+            refresh_per_second=1,
         )
-        self.task = self.bar.add_task(title, total=total, completed=done, text="")
+        self.task = self.bar.add_task(title, total=total, completed=done, text="", start=False)
 
-    def start(self) -> None:
-        """Show the bar."""
+    def start(self, text: str) -> None:
+        """Show the bar. Its clock runs, whatever it waits for: programs that compile, episodes of
+        the first generation."""
         if self.console.is_terminal:
+            self.bar.start_task(self.task)
+            self.bar.update(self.task, text=text)
             self.bar.start()
 
     def stop(self) -> None:
@@ -87,7 +91,7 @@ class Progress:
         # episodes begin at once.
         self.say("is starting; programs compile when they are first needed, once per machine")
         if self.shown:
-            self.line.start()
+            self.line.start("compiling, then the first generation")
 
     def update(self, generation: int, row: dict[str, Any], seconds: float) -> None:
         """The generations up to this one took `seconds`; `row` holds the metrics of the last."""

@@ -20,7 +20,7 @@ changed in any other way than by appending costs time, never rows.
 import json
 import re
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -151,14 +151,18 @@ class Stored(NamedTuple):
         return whole
 
 
+def buffers(tree: PyTree) -> list[tuple[tuple[Any, ...], Replay]]:
+    """All replay buffers in `tree`, each behind its path."""
+    nodes = tree_flatten_with_path(tree, is_leaf=lambda node: isinstance(node, Replay))[0]
+    return [(path, node) for path, node in nodes if isinstance(node, Replay)]
+
+
 def names(tree: PyTree) -> set[str]:
     """The paths of all numbers of all replay buffers in `tree`."""
-    nodes = tree_flatten_with_path(tree, is_leaf=lambda node: isinstance(node, Replay))[0]
     return {
         keystr((*path, *at))
-        for path, node in nodes
-        if isinstance(node, Replay)
-        for at, leaf in tree_flatten_with_path(node)[0]
+        for path, buffer in buffers(tree)
+        for at, leaf in tree_flatten_with_path(buffer)[0]
         if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
     }
 
@@ -169,8 +173,7 @@ def rings(tree: PyTree) -> list[Ring]:
     Those others are stacked ones (of several seeds, say), and those with bits set in rows that
     were never written.
     """
-    nodes = tree_flatten_with_path(tree, is_leaf=lambda node: isinstance(node, Replay))[0]
-    found = [_ring(path, node) for path, node in nodes if isinstance(node, Replay)]
+    found = (_ring(path, buffer) for path, buffer in buffers(tree))
     return [ring for ring in found if ring is not None]
 
 
@@ -193,9 +196,10 @@ def describe(rings: list[Ring]) -> str:
     )
 
 
-def stored(folder: Path, description: str) -> dict[str, Stored]:
-    """The leaves of all buffers in the checkpoint `folder`, by name."""
-    files = [(match, folder / match[0]) for match in map(NAME.fullmatch, _listed(folder)) if match]
+def stored(folder: Path, names: Iterable[str], description: str) -> dict[str, Stored]:
+    """The leaves of all buffers in the checkpoint `folder`, whose files have these `names`, by
+    name."""
+    files = [(match, folder / match[0]) for match in map(NAME.fullmatch, names) if match]
     found = {}
     for index, leaves in enumerate(json.loads(description)):
         held = [(int(m[2]), int(m[3]), path) for m, path in files if int(m[1]) == index]
@@ -225,10 +229,6 @@ def _file_name(index: int, rows: Mapping[str, Rows]) -> str:
             crc = zlib.crc32(piece, crc)
     part = next(iter(rows.values()))
     return f"replay{index}-{part.start:012d}-{part.stop:012d}-{crc:08x}.safetensors"
-
-
-def _listed(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
 
 
 def _is_on_cpu(leaf: jax.Array) -> bool:

@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 from .. import compilation
 from ..environments.host import EnvironmentFailure
 from ..replay import shapes_alone
-from . import checkpoint, config, files, log, policy, record
+from . import checkpoint, config, log, policy, record
 from .policy import Policy
 from .progress import best_of
 from .record import RunError
@@ -158,15 +158,13 @@ class Run:
     def _verify_metrics(self) -> None:
         """Raise `RunError` if metrics.csv is not what the newest intact checkpoint says it was."""
         for folder in sorted((self.path / "checkpoints").glob("[0-9]*"), reverse=True):
-            try:
-                seals = json.loads(files.read_bytes(folder / checkpoint.COMMIT))["seals"]
-                sealed = seals["metrics"]
-            except (OSError, ValueError, KeyError, TypeError):
+            seals = checkpoint.seals_of(folder)
+            if "metrics" not in seals:
                 continue  # damaged, or written by an older version
-            why = self.differs(sealed)
+            why = self.differs(seals["metrics"])
             if why is None:
                 return
-            ours = record.stranger(self.config, seals["record"]) is None
+            ours = record.stranger(self.config, seals.get("record")) is None
             if ours and checkpoint.damage(folder) is None:
                 raise RunError(
                     f"{why}; `credo resume` goes on from the newest checkpoint it agrees with"
