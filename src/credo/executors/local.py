@@ -189,7 +189,7 @@ def run(
 class _Worker(NamedTuple):
     """A process that has a job."""
 
-    process: Child
+    process: Any  # a `Child`, whose streams are pipes
     core: int
     job: Job
 
@@ -211,7 +211,7 @@ class _Crew:
             with self.signals:
                 self.line.start(self.told())
                 for i in range(number):
-                    self.give(_start(cores[i % len(cores)]), cores[i % len(cores)])
+                    self.give(None, cores[i % len(cores)])
                 while self.under_way:
                     if self.signals.received and asked is None:
                         asked = time.monotonic()
@@ -226,16 +226,14 @@ class _Crew:
             self.line.stop()
         return self.signals.received
 
-    def give(self, process: Child, core: int) -> None:
-        """Give a worker the next job; without one it ends."""
+    def give(self, process: Any, core: int) -> None:
+        """Give the next job to a worker, or to a new one; without a job it ends."""
         job = None if self.signals.received else next(self.queue, None)
         if job is None:
-            _close(process.stdin)
-            process.end(GRACE)
-            _close(process.stdout)
+            _end(process)
             return
+        process = process or _start(core)
         self.under_way.append(_Worker(process, core, job))
-        assert process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # it is dead, and `listen` hears of it
             process.stdin.write(job.message() + "\n")
             process.stdin.flush()
@@ -253,10 +251,8 @@ class _Crew:
                 self.done += 1
                 self.line.show(f"{self.told()} {job.path}", self.done)
             if "error" in answer:
-                process.end(0.0)
-                _close(process.stdin)
-                _close(process.stdout)
-                process = _start(core)
+                _end(process)
+                process = None
             self.give(process, core)
 
     def show(self) -> None:
@@ -284,14 +280,21 @@ def _start(core: int) -> Child:
     return Child(worker.__name__, str(core), stdin=pipe, stdout=pipe, text=True)
 
 
-def _answer(process: Child) -> dict[str, Any]:
+def _answer(process: Any) -> dict[str, Any]:
     """The answer of a worker; without one its process has ended when this returns."""
-    assert process.stdout is not None
     try:
         return json.loads(process.stdout.readline())
     except json.JSONDecodeError:
         process.end(0.5)  # it may be about to end by itself
         return {"error": f"its process ended with exit code {process.returncode}"}
+
+
+def _end(process: Any) -> None:
+    """Let a worker end, if there is one: it does when nothing more can come."""
+    if process is not None:
+        _close(process.stdin)
+        process.end(GRACE)
+        _close(process.stdout)
 
 
 def _close(stream: Any) -> None:

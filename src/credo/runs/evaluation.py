@@ -51,16 +51,14 @@ class Result(NamedTuple):
 
 
 @float32()
-def played(run: Run, task: Any, episodes: int | None, seed: int, *, best: bool = False) -> Result:
-    """Fresh episodes of a run's champion, or of its `best` policy, on `task`, which may differ from
+def played(run: Run, task: Any, episodes: int | None, seed: int) -> Result:
+    """Fresh episodes of a run's champion on `task`, which may differ from
     the one it was trained on. `episodes`: None for `EPISODES`, or `HOST_EPISODES` of a task outside
     JAX."""
     if episodes is None:
         host = issubclass(type(task), AbstractHostEnvironment)
         episodes = HOST_EPISODES if host else EPISODES
-    evaluation = in_turn(
-        task, tree.stack(run.best if best else run.champion), episodes, key=_key(seed)
-    )
+    evaluation = in_turn(task, tree.stack(run.champion), episodes, key=_key(seed))
     returns = {name: np.asarray(evaluation.returns[name][0], np.float64) for name in task.signals}
     whole = ~np.any([np.isnan(x.reshape(episodes, -1)).any(1) for x in returns.values()], axis=0)
     scores = {name: _score(values[whole]) for name, values in returns.items()}
@@ -70,13 +68,13 @@ def played(run: Run, task: Any, episodes: int | None, seed: int, *, best: bool =
 
 
 def describe(
-    run: Run, task: Any, episodes: int | None, seed: int, *, best: bool = False
+    run: Run, task: Any, episodes: int | None, seed: int
 ) -> tuple[list[str], Result | None]:
     """What `played` finds, in lines for people. Sequences so deep that they are streamed have no
     result beside them."""
     if _streamed(task):
-        return list(_stream(run, task, episodes, seed, best)), None
-    result = played(run, task, episodes, seed, best=best)
+        return list(_stream(run, task, episodes, seed)), None
+    result = played(run, task, episodes, seed)
     return list(_lines(run, task, result)), result
 
 
@@ -132,12 +130,12 @@ def _streamed(task: Any) -> bool:
 
 
 def _stream(
-    run: Run, task: SequenceClassification, episodes: int | None, seed: int, best: bool
+    run: Run, task: SequenceClassification, episodes: int | None, seed: int
 ) -> Iterator[str]:
     """Lines about the champion on sequences of any length, whose memory does not grow with it."""
     streams = min(episodes or EPISODES, 20)
     lengths = counting.longest_correct(
-        tree.stack(run.best if best else run.champion),
+        tree.stack(run.champion),
         task.depth,
         streams,
         min_gap=task.min_gap,

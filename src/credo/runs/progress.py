@@ -30,7 +30,8 @@ class Line:
             console=self.console,
             refresh_per_second=1,
         )
-        self.task = self.bar.add_task(title, total=total, completed=done, text="", start=False)
+        self.task = self.bar.add_task(title, total=total, text="", start=False)
+        self.bar.update(self.task, completed=done)
 
     def start(self, text: str) -> None:
         """Show the bar. Its clock runs, whatever it waits for: programs that compile, episodes of
