@@ -102,10 +102,7 @@ class Job:
             return False  # killed since: what the rows say is not what the champion is
         done = int(row["generation"]), int(row["frames"])
         if self.again is not None:
-            try:
-                self.budget.refuse_smaller(Budget(**run.config["budget"]), *done)
-            except ValueError as error:
-                raise RunError(f"{self.path}: {error}") from None
+            self.budget.refuse_smaller(Budget(**run.config["budget"]), *done, self.path)
         return self.budget.reached(*done, float(row["champion_score"])) is not None
 
     def _require_same(self, run: Run) -> None:

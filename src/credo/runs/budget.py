@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from .options import RunOptions
+from .record import RunError
 
 DEFAULT = {"generations": 1000}
 
@@ -66,18 +67,17 @@ class Budget:
         shares = generation / (self.generations or np.inf), frames / (self.frames or np.inf)
         return min(1.0, max(shares))
 
-    def refuse_smaller(self, old: "Budget", generation: int, frames: int) -> None:
-        """Raise if this is no more than a run with the budget `old` was to do, or has done."""
+    def refuse_smaller(self, old: "Budget", generation: int, frames: int, path: Any) -> None:
+        """Raise `RunError` if this is no more than the run at `path` with the budget `old` was to
+        do, or has done."""
         for name, done in (("generations", generation), ("frames", frames)):
-            new, before = getattr(self, name), getattr(old, name)
+            new, before, told = getattr(self, name), getattr(old, name), None
             if new is not None and before is not None and new < before:
-                raise ValueError(
-                    f"this run's budget is {before} {name}: a new budget must be larger, not {new}"
-                )
-            if new is not None and before is None and new < done:
-                raise ValueError(
-                    f"this run has done {done} {name}: a new budget must be larger, not {new}"
-                )
+                told = f"this run's budget is {before} {name}"
+            elif new is not None and before is None and new < done:
+                told = f"this run has done {done} {name}"
+            if told is not None:
+                raise RunError(f"{path}: {told}: a new budget must be larger, not {new}")
 
 
 def fitted(algorithm: Any, budget: Budget) -> Any:

@@ -48,7 +48,6 @@ CODES = {
     "float32": "F32",
     "float64": "F64",
 }
-DTYPES = {np.dtype(jnp.dtype(name)): code for name, code in CODES.items()}
 
 
 class CheckpointError(Exception):
@@ -182,6 +181,7 @@ def load(
 
 
 def _warn_of(damaged: Mapping[str, str], used: Path, without_replay: bool) -> None:
+    """Name each checkpoint that was passed over, and a buffer that is left out."""
     for name, why in damaged.items():
         warnings.warn(
             f"checkpoint {used.with_name(name)} is damaged ({why}): using {used.name} instead",
@@ -197,6 +197,8 @@ def _warn_of(damaged: Mapping[str, str], used: Path, without_replay: bool) -> No
 
 
 def _loaded(folder: Path, like: PyTree, extra: PyTree, without_replay: bool) -> Checkpoint:
+    """Read a checkpoint that was found whole. Raises `CheckpointError` if it does not fit
+    `like`."""
     metadata, arrays = _read(folder / STATE)
     more = {name: arrays.pop(name) for name in list(arrays) if name.startswith(EXTRA)}
     empty = segments.names(like) if without_replay else set()
@@ -292,6 +294,7 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _describe(leaf: Any) -> str:
+    """A leaf as `float32[3, 2]`, by which two are the same; a typed key as `key<fry>[]`."""
     return f"{leaf.dtype}{list(leaf.shape)}"
 
 
@@ -307,9 +310,9 @@ def _leaves(tree: PyTree, extra: PyTree = None) -> tuple[dict[str, Any], dict[st
             raise CheckpointError(f"two leaves are named {name}: give them different names")
         if _is_key(leaf):
             keys[name], leaf = str(jax.random.key_impl(leaf)), jax.random.key_data(leaf)
-        if leaf.dtype not in DTYPES or jax.dtypes.canonicalize_dtype(leaf.dtype) != leaf.dtype:
+        if str(leaf.dtype) not in CODES or jax.dtypes.canonicalize_dtype(leaf.dtype) != leaf.dtype:
             raise CheckpointError(
-                f"leaf {name} is {_describe(leaf)}: stored are {', '.join(map(str, DTYPES))}, "
+                f"leaf {name} is {_describe(leaf)}: stored are {', '.join(CODES)}, "
                 "and 64 bits only where jax_enable_x64 is on; convert it"
             )
         leaves[name] = leaf
@@ -359,6 +362,8 @@ def _fit(
 
 
 def _check_same(path: Path, expected: dict[str, str], found: dict[str, str]) -> None:
+    """Raise `CheckpointError`, which names the first ten, if leaves differ by name, shape or
+    dtype."""
     differing = [
         f"\n  {name}: found {found.get(name, 'no array')}, "
         f"expected {expected.get(name, 'no array')}"
@@ -378,6 +383,7 @@ def _check_same(path: Path, expected: dict[str, str], found: dict[str, str]) -> 
 
 
 def _bytes(leaf: Any) -> memoryview:
+    """All bytes of an array in C order; of one on a device a copy."""
     return np.ascontiguousarray(leaf).reshape(-1).view(np.uint8).data
 
 
@@ -386,11 +392,15 @@ def _size(leaves: Mapping[str, Any]) -> int:
 
 
 def _header(leaves: Mapping[str, Any], metadata: Mapping[str, str]) -> bytes:
+    """What stands before the arrays: eight bytes of length, then JSON of dtypes, shapes and places.
+
+    Its order is ours, so that equal states are equal bytes: the library orders metadata at random.
+    """
     entries: dict[str, Any] = {"__metadata__": metadata}
     end = 0
     for name, leaf in leaves.items():
         start, end = end, end + leaf.nbytes
-        code = DTYPES[leaf.dtype]
+        code = CODES[str(leaf.dtype)]
         entries[name] = {"dtype": code, "shape": leaf.shape, "data_offsets": [start, end]}
     text = json.dumps(entries).encode()
     text += b" " * (-len(text) % 8)
@@ -398,6 +408,7 @@ def _header(leaves: Mapping[str, Any], metadata: Mapping[str, str]) -> bytes:
 
 
 def _chunks(header: bytes, leaves: Mapping[str, Any]) -> Iterator[bytes | memoryview]:
+    """A whole file, piece by piece: no second copy of an array is held."""
     yield header
     for leaf in leaves.values():
         yield from leaf.pieces() if isinstance(leaf, segments.Rows) else [_bytes(leaf)]
@@ -413,6 +424,7 @@ def _checksum(metadata: Mapping[str, str], leaves: Mapping[str, Any]) -> str:
 
 
 def _plain_text(what: str, values: dict[str, Any]) -> bytes:
+    """Values as JSON. Raises `ValueError` if they would not come back as they are."""
     text = json.dumps(values, indent=2)
     # Python's text of a float is exact, and its comparison by text also holds for NaN.
     if repr(json.loads(text)) != repr(values):
@@ -436,6 +448,8 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
 
 
 def _read_rows(stored: segments.Stored) -> np.ndarray:
+    """A whole leaf of a buffer. Raises `CheckpointError` if a part of it is not what its name
+    says."""
     try:
         return stored.read()
     except (SafetensorError, ValueError) as error:
@@ -443,6 +457,8 @@ def _read_rows(stored: segments.Stored) -> np.ndarray:
 
 
 def _read_export(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
+    """Metadata and arrays of an exported policy, whose SHA-256 is right; raises
+    `CheckpointError`."""
     metadata, arrays = _read(path)
     checksum = metadata.pop(CHECKSUM, None)
     if checksum is None or KEYS not in metadata:
@@ -476,6 +492,7 @@ def _remove_unfinished(directory: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
+    """Remove a checkpoint. Raises `OSError` if it cannot even be renamed."""
     # Under another name first: killed half-way, it must not look like a damaged checkpoint.
     removed = _beside(folder, "removed")
     files.remove(removed)
@@ -548,11 +565,13 @@ _seen: dict[tuple[int, ...], dict[str, Any]] = {}  # fingerprints, by what tells
 
 
 def _identity(path: Path) -> tuple[int, ...]:
+    """What tells a file from any other, and from itself after a write."""
     status = os.stat(path)
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _known_fingerprint(path: Path, *, reread: bool) -> dict[str, Any]:
+    """That of a file, which is read if this process has not seen it, or to `reread` it."""
     identity = _identity(path)
     if reread or identity not in _seen:
         _seen[identity] = _fingerprint(path)
@@ -560,6 +579,7 @@ def _known_fingerprint(path: Path, *, reread: bool) -> dict[str, Any]:
 
 
 def _write_part(path: Path, rows: Mapping[str, segments.Rows]) -> None:
+    """Write a file of rows, of which the fingerprint is known from now on."""
     order = sorted(rows, key=lambda name: (-rows[name].dtype.itemsize, name))
     rows = {name: rows[name] for name in order}
     fingerprint = _write(path, _chunks(_header(rows, {}), rows))
@@ -621,6 +641,7 @@ def _intact_parts(directory: Path, names: Iterable[str], but: Path | None) -> di
 
 
 def _files_in(folder: Path) -> set[tuple[int, ...]]:
+    """Device and inode of all files in a folder; none if it cannot be read."""
     with contextlib.suppress(OSError):
         return {_identity(folder / name)[:2] for name in os.listdir(folder)}
     return set()
@@ -642,6 +663,7 @@ def _write(path: Path, chunks: Iterable[bytes | memoryview]) -> dict[str, Any]:
 
 
 def _fingerprint(path: Path) -> dict[str, Any]:
+    """Size and SHA-256 of a file, read in pieces. Raises `OSError`."""
     with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
         return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), "bytes": file.tell()}
 
@@ -673,6 +695,7 @@ def _commit(folder: Path) -> dict[str, Any]:
 
 
 def _commit_text(generation: int, files: Mapping[str, Any], seals: Mapping[str, Any] = {}) -> bytes:
+    """COMMIT as it is written, byte for byte. Seals are hashed too: no file stands for them."""
     commit: dict[str, Any] = {"generation": generation, "files": files}
     if seals:
         text = json.dumps(seals, sort_keys=True)

@@ -114,6 +114,7 @@ def from_tree(tree: Any, *, trust: bool = True, source: str = "this record") -> 
 
 
 def _untrusted(source: str, named: str) -> str:
+    """Why a record is not read, and what to do."""
     return (
         f"{source} was not made here and names {named}, which is somebody's own code: look into "
         "config.json, then give --trust (from Python Run(path, trust=True))"
@@ -333,6 +334,7 @@ def _version(package: str) -> str | None:
 
 
 def _processor() -> str:
+    """The name of the processor as the system has it."""
     try:
         for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):

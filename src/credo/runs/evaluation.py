@@ -120,6 +120,7 @@ def _line(name: str, score: Score) -> str:
 
 
 def _key(seed: int) -> PRNGKeyArray:
+    """The key of fresh episodes."""
     return jax.random.fold_in(jax.random.key(seed), 1_000_003)  # not a key of any training run
 
 

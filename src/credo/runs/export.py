@@ -92,6 +92,8 @@ KINDS: dict[str, tuple[str, Any, Any]] = {
 
 
 def _describe(run: Run, network: dict[str, Any]) -> dict[str, Any]:
+    """What the runner must know, from the record of the run alone: sizes, actions, names of
+    agents."""
     env, task = run.config["algorithm"]["env"], task_of(run)
     while "id" not in env and "env" in env:  # what pays rewards later, say
         env = env["env"]

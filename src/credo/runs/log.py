@@ -189,6 +189,7 @@ def _lines(path: pathlib.Path) -> list[bytes]:
 
 
 def _cells(path: pathlib.Path, line: bytes) -> list[str]:
+    """A line as its cells. Raises `DamagedLog` if it is no text."""
     try:
         return next(csv.reader([line.decode()]), [])
     except (UnicodeDecodeError, csv.Error) as error:
@@ -202,6 +203,7 @@ def _generation(line: bytes) -> int | None:
 
 
 def _header(path: pathlib.Path) -> list[str] | None:
+    """The names of a table's columns; None if it has no whole first line."""
     try:
         with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
             line = file.readline(2**20)

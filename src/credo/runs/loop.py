@@ -200,6 +200,7 @@ def _begin(path: pathlib.Path, said: dict[str, Any], algorithm: Any, source: Run
 
 @jit
 def _initial(algorithm: Any, root: PRNGKeyArray) -> PyTree:
+    """The state of generation 0, in one program."""
     return algorithm.init(key=jax.random.fold_in(root, 0))
 
 
@@ -281,10 +282,7 @@ def _reopened(
     with run.found():
         record.check_task(run.config, algorithm.env)
         saved = _load(run, fit, without_replay)
-    try:
-        budget.refuse_smaller(old, saved.generation, int(saved.counters["frames"]))
-    except ValueError as error:
-        raise RunError(f"{run.path}: {error}") from None
+    budget.refuse_smaller(old, saved.generation, int(saved.counters["frames"]), run.path)
     for change in run.config.get("changes", []):  # of an older checkpoint it begins earlier
         change["generation"] = min(change["generation"], saved.generation)
     if settings:
@@ -329,6 +327,8 @@ def _shapes(algorithm: Any) -> Any:
 
 
 def _warn_of_other_machine(recorded: dict[str, Any]) -> None:
+    """Say under which conditions a run began, if they are others here: bits may differ from then
+    on."""
     here = config.machine()
     # What an older version did not record, a run of that time did not use.
     known = recorded.get("versions", {})

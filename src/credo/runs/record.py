@@ -155,6 +155,7 @@ def check_task(record: Mapping[str, Any], env: Any) -> None:
 
 
 def _sizes(env: Any) -> dict[str, Any]:
+    """Those of a task today; None for those that it has not. It opens a task outside JAX."""
     sizes: dict[str, Any] = {name: getattr(env, name, None) for name in SIZES}
     return sizes | {"discrete": bool(getattr(env, "discrete", False))}
 
@@ -174,6 +175,7 @@ def home(record: Mapping[str, Any]) -> str:
 
 
 def _checksum(content: dict[str, Any]) -> str:
+    """The short hash of all other fields."""
     return trust.short({k: v for k, v in content.items() if k != trust.CHECKSUM})
 
 
@@ -190,6 +192,8 @@ def _whole(value: Any, least: int = 0, most: int = 2**63 - 1) -> bool:
 
 
 def _is_object(value: Any) -> bool:
+    """Whether this may be an object's tree: nothing is looked up before its class has a proper
+    name."""
     return isinstance(value, dict) and CLASS.fullmatch(str(value.get("class"))) is not None
 
 
@@ -198,6 +202,7 @@ def _is_algorithm(value: Any) -> bool:
 
 
 def _is_budget(value: Any) -> bool:
+    """At least one whole limit, and nothing that is none of a budget's fields."""
     if not (isinstance(value, dict) and value.keys() <= {"generations", "frames", "stop_at"}):
         return False
     limits = [value[k] for k in ("generations", "frames") if value.get(k) is not None]
@@ -206,6 +211,7 @@ def _is_budget(value: Any) -> bool:
 
 
 def _is_machine(value: Any) -> bool:
+    """Older records lack some of it."""
     if not (isinstance(value, dict) and isinstance(value.get("versions", {}), dict)):
         return False
     named = [value.get(name, "") for name in ("processor", "device", "system")]

@@ -22,6 +22,7 @@ class Stream:
         self._inner = inner  # None where the process was started without one
 
     def write(self, text: str) -> int:
+        """Never raises for want of a reader; characters that the stream has not are escaped."""
         with _unread(self._inner):
             try:
                 self._inner.write(text)

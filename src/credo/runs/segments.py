@@ -69,6 +69,7 @@ class Rows(NamedTuple):
             at += n
 
     def _on_host(self, first: int, last: int) -> np.ndarray:
+        """Rows `first` to `last` of the ring as NumPy."""
         if isinstance(self.leaf, np.ndarray) or _is_on_cpu(self.leaf):
             return np.asarray(self.leaf)[first:last]  # a view: no copy
         at = min(first, self.leaf.shape[0] - self.block)
@@ -209,6 +210,8 @@ def stored(folder: Path, names: Iterable[str], description: str) -> dict[str, St
 
 
 def _ring(path: tuple[Any, ...], replay: Replay) -> Ring | None:
+    """A buffer as one that can be cut: unstacked, without keys, and zero where nothing was
+    written."""
     data = tree_flatten_with_path(replay.data)[0]
     leaves = {keystr((*path, GetAttrKey("data"), *at)): leaf for at, leaf in data}
     capacities = {leaf.shape[:1] for leaf in leaves.values()}
@@ -222,6 +225,7 @@ def _ring(path: tuple[Any, ...], replay: Replay) -> Ring | None:
 
 
 def _file_name(index: int, rows: Mapping[str, Rows]) -> str:
+    """That of a part: number of the buffer, range of rows, and the CRC-32 of leaves and rows."""
     crc = 0
     for name, part in rows.items():
         crc = zlib.crc32(f"{name} {part.dtype}{list(part.shape)}".encode(), crc)
