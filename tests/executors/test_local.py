@@ -245,12 +245,12 @@ def gone(pid, seconds=20):
 
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-# Deaf to signals and to the end of its input, with a child in its group; it says who they are.
-DEAF = """
+# With a child in its group; it says who they are. Told "deaf" it does not end by a signal.
+STUBBORN = """
 import os, signal, subprocess, sys, time
 def main():
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if sys.argv[2] == "deaf":
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
     child = subprocess.Popen(["sleep", "100"])
     open(sys.argv[1], "w").write(f"{os.getpid()} {child.pid} ")
     time.sleep(100)
@@ -260,9 +260,10 @@ import subprocess, sys
 from credo.environments.processes import Child
 from credo.executors import local
 from credo.runs.options import RunOptions
-folder, pipe = sys.argv[1], subprocess.PIPE
+folder, hearing = sys.argv[1:]
 sys.path.append(folder)
-local._start = lambda core: Child("deaf", folder + "/told", stdin=pipe, stdout=pipe, text=True)
+given = {"grace": 3600.0, "stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+local._start = lambda core: Child("stubborn", folder + "/told", hearing, **given)
 local.Job.finished = lambda self: False
 options = RunOptions(generations=5)
 local.run([local.Job(folder + "/run", {"class": "a:B"}, 0, options)], workers=1)
@@ -270,11 +271,12 @@ local.run([local.Job(folder + "/run", {"class": "a:B"}, 0, options)], workers=1)
 
 
 @pytest.fixture
-def deaf(tmp_path):
-    """A process whose worker is deaf, and what this says of itself and its child."""
-    (tmp_path / "deaf.py").write_text(DEAF)
+def runs(tmp_path, request):
+    """A process that has a worker, and the numbers of this and of its child."""
+    (tmp_path / "stubborn.py").write_text(STUBBORN)
     told = tmp_path / "told"
-    process = subprocess.Popen([sys.executable, "-c", RUNS, str(tmp_path)], stderr=-1, text=True)
+    command = [sys.executable, "-c", RUNS, str(tmp_path), request.param]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         deadline = time.monotonic() + 60
         while not (told.exists() and told.read_text().endswith(" ")):
@@ -290,8 +292,9 @@ def deaf(tmp_path):
 
 
 @linux
-def test_a_second_signal_ends_workers_that_are_deaf_to_it(deaf):
-    process, workers = deaf
+@pytest.mark.parametrize("runs", ["deaf"], indirect=True)
+def test_a_second_signal_ends_workers_that_are_deaf_to_it(runs):
+    process, workers = runs
     process.send_signal(signal.SIGINT)
     time.sleep(0.5)
     assert process.poll() is None
@@ -305,8 +308,9 @@ def test_a_second_signal_ends_workers_that_are_deaf_to_it(deaf):
 
 
 @linux
-def test_workers_end_with_a_parent_that_is_killed(deaf):
-    process, workers = deaf
+@pytest.mark.parametrize("runs", ["hearing"], indirect=True)
+def test_workers_end_with_a_parent_that_is_killed(runs):
+    process, workers = runs
     assert not gone(workers[0], 0.2)
     process.kill()
     process.communicate()

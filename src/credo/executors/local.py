@@ -31,7 +31,7 @@ from . import worker
 
 TOLD = 60.0  # seconds between two lines on the runs under way, where there is no terminal
 GRACE = 10.0  # seconds that a worker without a job has to end in
-SAVE = 3600.0  # seconds that workers have to finish a generation and save, after a signal
+SAVE = 3600.0  # seconds to finish a generation and save in, after a signal or our end
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,7 +192,12 @@ class _Worker(NamedTuple):
 
 
 class _Crew:
-    """Workers that take jobs until there are none."""
+    """Workers that take jobs until there are none.
+
+    - `queue`: jobs that no worker had yet; `under_way`: workers with their jobs; `done`: jobs that
+      ended, well or not, of `total`.
+    - `failures`: a line for each job that failed: its path and what its worker said.
+    """
 
     def __init__(self, jobs: Sequence[Job], title: str):
         self.queue, self.total, self.done = iter(jobs), len(jobs), 0
@@ -203,19 +208,17 @@ class _Crew:
 
     def work(self, number: int) -> int:
         """Do all jobs with this many workers; the signal that ended it, or 0."""
-        cores, asked = config.available_cores(), None
+        cores, asked = config.available_cores(), False
         try:
             with self.signals:
                 self.line.start(self.told())
                 for i in range(number):
                     self.give(None, cores[i % len(cores)])
                 while self.under_way:
-                    if self.signals.received and asked is None:
-                        asked = time.monotonic()
+                    if self.signals.received and not asked:
+                        asked = True
                         for one in self.under_way:
-                            _close(one.process.stdin)  # by which they save
-                    if asked is not None and time.monotonic() - asked > SAVE:
-                        self.end()
+                            one.process.terminate()  # by which they save
                     self.listen()
                     self.show()
         finally:
@@ -268,13 +271,13 @@ class _Crew:
     def end(self) -> None:
         """End all workers at once, and whatever they started."""
         for one in self.under_way:
-            one.process.end(0.0)
+            _kill(one.process)
 
 
 def _start(core: int) -> Child:
     """A worker that computes on this core alone."""
     pipe = subprocess.PIPE
-    return Child(worker.__name__, str(core), stdin=pipe, stdout=pipe, text=True)
+    return Child(worker.__name__, str(core), grace=SAVE, stdin=pipe, stdout=pipe, text=True)
 
 
 def _answer(process: Any) -> dict[str, Any]:
@@ -282,18 +285,25 @@ def _answer(process: Any) -> dict[str, Any]:
     try:
         return json.loads(process.stdout.readline())
     except json.JSONDecodeError:
-        process.end(0.5)  # it may be about to end by itself
+        process.over(0.5)  # it may be about to end by itself
+        _kill(process)
         return {"error": f"its process ended with exit code {process.returncode}"}
 
 
 def _end(process: Any) -> None:
     """Let a worker end, if there is one: it does when nothing more can come."""
     if process is not None:
-        _close(process.stdin)
-        process.end(GRACE)
-        _close(process.stdout)
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+        process.over(GRACE)
+        _kill(process)
+        process.stdout.close()
 
 
-def _close(stream: Any) -> None:
-    with contextlib.suppress(BrokenPipeError):
-        stream.close()
+def _kill(process: Any) -> None:
+    """End a worker at once, and whatever it started: its guardian waits only if it is told once."""
+    for _ in range(100):
+        if process.over(0.05):
+            break
+        process.terminate()
+    process.end(0.0)

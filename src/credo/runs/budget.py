@@ -13,7 +13,11 @@ DEFAULT = {"generations": 1000}
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """A run ends after the first generation that reaches one of these. None: no such limit."""
+    """A run ends after the first generation that reaches one of these. None: no such limit.
+
+    Frames are environment steps of everything that plays; a team's joint step is one. Raises
+    `ValueError` without a limit of generations or of frames.
+    """
 
     generations: int | None = None
     frames: int | None = None  # environment steps of everything that played
@@ -82,7 +86,8 @@ class Budget:
 
 def fitted(algorithm: Any, budget: Budget) -> Any:
     """`algorithm` with a replay buffer that is no larger than what `budget` can fill: as long as it
-    never wraps, its capacity changes no bit. What is recorded stays the user's number.
+    never wraps, its capacity changes no bit. What is recorded stays the user's number; in use is
+    the next power of two, so that budgets of about the same size are one program.
 
     It needs `most_frames`, an upper bound of the frames of one generation.
     """
@@ -95,7 +100,6 @@ def fitted(algorithm: Any, budget: Budget) -> Any:
         bounds.append(budget.generations * most)
     if budget.frames is not None:
         bounds.append(budget.frames - 1 + most)  # the last generation begins before the limit
-    # Budgets of about the same size share their programs.
     rows = min(capacity, 1 << (max(1, min(bounds)) - 1).bit_length())
     return dataclasses.replace(algorithm, replay_capacity=rows)
 

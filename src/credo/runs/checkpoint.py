@@ -59,7 +59,8 @@ class DamagedCheckpoint(UserWarning):
 
 
 class Checkpoint(eqx.Module):
-    """What `load` found."""
+    """What `load` found: the state and the tree besides it as JAX arrays, counters and seals as
+    they were given to `save`, and the folder they came from."""
 
     generation: int
     state: PyTree
@@ -439,7 +440,7 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
     """The metadata and the arrays of a file."""
     try:
         with _explained(f"cannot read {path}", path.parent):
-            os.close(files.opened(path, os.O_RDONLY, follow=True))  # the library waits for a pipe
+            files.reading(path).close()  # the library waits for a pipe
             with safe_open(path, framework="numpy") as file:
                 metadata, names = file.metadata() or {}, file.keys()
                 return metadata, {name: file.get_tensor(name) for name in names}
@@ -601,7 +602,11 @@ def _linkable(
     folder: Path, parts: Mapping[str, Mapping[str, segments.Rows]], needed: int, keep: int
 ) -> tuple[dict[str, Path], int]:
     """Where files of these parts are that the checkpoint in `folder` may share, and how many bytes
-    the others take, besides the `needed` ones."""
+    the others take, besides the `needed` ones.
+
+    None of the checkpoint just before, so that no damaged file spoils two in a row; unless only one
+    checkpoint is kept, or so little is free that the next one might not fit: that is a warning.
+    """
 
     def size(there: Mapping[str, Path]) -> int:
         return sum(_size(rows) for name, rows in parts.items() if name not in there)
@@ -664,7 +669,7 @@ def _write(path: Path, chunks: Iterable[bytes | memoryview]) -> dict[str, Any]:
 
 def _fingerprint(path: Path) -> dict[str, Any]:
     """Size and SHA-256 of a file, read in pieces. Raises `OSError`."""
-    with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
+    with files.reading(path) as file:
         return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), "bytes": file.tell()}
 
 

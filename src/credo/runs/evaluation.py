@@ -34,7 +34,7 @@ def in_turn(task: Any, policies: Any, episodes: int, *, key: PRNGKeyArray) -> Ev
 
 
 class Score(NamedTuple):
-    """What one reward signal came to."""
+    """What one reward came to, in the task's own units: returns over episodes that ended."""
 
     mean: float
     error: float  # standard error of the mean over episodes; NaN of a single one
@@ -71,7 +71,11 @@ def describe(
     run: Run, task: Any, episodes: int | None, seed: int
 ) -> tuple[list[str], Result | None]:
     """What `played` finds, in lines for people. Sequences so deep that they are streamed have no
-    result beside them."""
+    result beside them.
+
+    **Arguments:** as `played`: `episodes`, at least 1, or None for the default of the task; `seed`
+    of the fresh episodes, which no training run has, whatever its own seed.
+    """
     if _streamed(task):
         return list(_stream(run, task, episodes, seed)), None
     result = played(run, task, episodes, seed)
@@ -108,7 +112,8 @@ def _lines(run: Run, task: Any, result: Result) -> Iterator[str]:
 
 
 def summary(path: pathlib.Path, results: list[Result]) -> Iterator[str]:
-    """Several runs together: a run's mean is one value."""
+    """Several runs together, in lines for people: a run's mean is one value, and ± is the standard
+    error over runs."""
     yield f"{path}: {len(results)} runs, mean ± standard error over runs"
     for name in results[0].scores:
         yield _line(name, _score(np.array([result.scores[name].mean for result in results])))

@@ -14,7 +14,7 @@ import shutil
 import stat
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 MOST = 64 * 2**20  # bytes that are read at once, unless more is asked for
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -120,9 +120,8 @@ def remove(path: str | os.PathLike[str]) -> None:
 def read_bytes(path: str | os.PathLike[str], most: int = MOST) -> bytes:
     """A regular file. Raises `OSError` if it is none or cannot be read, and `ValueError` if it has
     more than `most` bytes; both name it."""
-    descriptor = opened(path, os.O_RDONLY, follow=True)
-    with open(descriptor, "rb") as file:
-        size = os.fstat(descriptor).st_size
+    with reading(path) as file:
+        size = os.fstat(file.fileno()).st_size
         if size > most:
             raise ValueError(f"{path} has {size:,} bytes: at most {most:,} are read")
         return file.read()
@@ -137,6 +136,11 @@ def read_text(path: str | os.PathLike[str], most: int = MOST) -> str:
             f"{path} is damaged: its byte {error.start} is {error.object[error.start]:#x}, "
             "which is no UTF-8 text"
         ) from None
+
+
+def reading(path: str | os.PathLike[str]) -> BinaryIO:
+    """A regular file, open for reading: never waits, and a link is followed. Raises `OSError`."""
+    return open(opened(path, os.O_RDONLY, follow=True), "rb")
 
 
 def opened(path: str | os.PathLike[str], flags: int, *, follow: bool = False) -> int:

@@ -37,10 +37,9 @@ def runs_in(path: str | pathlib.Path) -> list[pathlib.Path]:
     return sorted(inside, key=lambda run: number.sub(lambda m: m[0].zfill(20), run.name))
 
 
-def free_name(algorithm: Any, seed: int | str, label: str = "") -> pathlib.Path:
-    """A folder that does not exist. `label`: what stands before the seed; by default the words for
-    the algorithm and the task (`names.run_name`)."""
-    label = label or run_name(to_tree(algorithm))
+def free_name(algorithm: Any, seed: int | str) -> pathlib.Path:
+    """A folder that does not exist, named by the words for the algorithm and the task."""
+    label = run_name(to_tree(algorithm))
     name = re.sub(r"[^\w.]+", "-", f"{label}-{seed}".lower())
     path, copies = pathlib.Path("runs") / name, 1
     while path.exists():

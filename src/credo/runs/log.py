@@ -36,7 +36,8 @@ class Log:
     """Appends rows. A run that is resumed is cut back to its checkpoint, so that generations are
     strictly increasing and equal to those of an undisturbed run.
 
-    `elapsed`: seconds of training before, as far as `timing.csv` tells.
+    `elapsed`: seconds of training before, as far as `timing.csv` tells. `size`, `digest`: bytes and
+    running SHA-256 of `metrics.csv`, as it was written. `clock`: whether `timing.csv` is written.
     """
 
     def __init__(self, directory: pathlib.Path, generation: int):
@@ -111,7 +112,7 @@ def verify(directory: pathlib.Path, seal: dict[str, Any]) -> None:
     path, size = directory / METRICS, seal["bytes"]
     digest, left = hashlib.sha256(), size
     try:
-        with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
+        with files.reading(path) as file:
             while left and (data := file.read(min(left, 2**20))):
                 digest.update(data)
                 left -= len(data)
@@ -165,7 +166,7 @@ def last(path: pathlib.Path) -> dict[str, str]:
     header = _header(path)
     if header is None:
         return {}
-    with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
+    with files.reading(path) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - 2**16))
         whole = file.read().split(b"\n")[1:-1]  # the first may lack its beginning
@@ -205,7 +206,7 @@ def _generation(line: bytes) -> int | None:
 def _header(path: pathlib.Path) -> list[str] | None:
     """The names of a table's columns; None if it has no whole first line."""
     try:
-        with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
+        with files.reading(path) as file:
             line = file.readline(2**20)
     except FileNotFoundError:
         return None

@@ -270,7 +270,12 @@ def _reopened(
     run: Run, options: RunOptions, settings: dict[str, Any], without_replay: bool
 ) -> tuple[Any, checkpoint.Checkpoint]:
     """The algorithm with its new settings, and the checkpoint to go on from. What is changed is put
-    into the record, which is not written yet."""
+    into the record, which is not written yet.
+
+    A replay buffer gets the largest of the capacities that its budgets and settings, old and new,
+    ask for: what it holds must fit. Raises `RunError` for a smaller budget, another task, and
+    settings that change what was learned in its shape; `CheckpointError` as `checkpoint.load`.
+    """
     algorithm, old = run.algorithm, Budget(**run.config["budget"])
     budget = Budget.of(algorithm, options, old)
     # A smaller budget is refused, but only once it is known how far the run is. A setting may make
@@ -297,7 +302,9 @@ def _reopened(
 
 
 def _changed(run: Run, fit: Any, settings: dict[str, Any], generation: int) -> Any:
-    """The algorithm with other settings, of the same state, and put into the record."""
+    """The algorithm with other settings, of the same state, and put into the record. Raises
+    `RunError` if any of them changes the shape of the state, and `ConfigError` for what is no
+    setting."""
     new = config.replaced(fit, settings)
     if "replay_capacity" in settings or _shapes(new) != _shapes(fit):
         told = ", ".join(f"{name}={value!r}" for name, value in settings.items())
@@ -367,7 +374,14 @@ def _train(
 
 
 class _Training:
-    """A run that goes on: where it is, what it writes and who hears of it."""
+    """A run that goes on: where it is, what it writes and who hears of it.
+
+    - `generation`, `frames`: how many are done; `safe`: the generation of the newest checkpoint.
+    - `state`, `best`: donated to every dispatch, so nobody else may hold them.
+    - `reached`: which limit of the budget was reached, in words; `ended`: why else it is to end.
+    - `chunk`: generations that the next dispatch may hold, at most `CHUNK`.
+    - `began`, `last_save`: seconds of the monotonic clock; `before`: seconds of training before.
+    """
 
     def __init__(
         self,
@@ -425,7 +439,11 @@ class _Training:
         return self.ended or "signal"
 
     def dispatch(self) -> None:
-        """Some generations: play, write, tell, and save now and then."""
+        """Some generations: play, write, tell, and save now and then.
+
+        Raises `RunError` if weights are no numbers any more or a task outside JAX failed, and
+        `OSError` or `CheckpointError` if the disk did.
+        """
         tick = time.monotonic()
         rows = self.play()
         self.require_sound()
@@ -475,7 +493,11 @@ class _Training:
         )
 
     def save(self) -> None:
-        """A checkpoint, then the policies: what a policy's file says is never ahead of it."""
+        """A checkpoint, then the policies: what a policy's file says is never ahead of it.
+
+        Rows of metrics are on the disk before, so that a checkpoint is never ahead of them either.
+        Raises `CheckpointError`, `OSError` and `log.DamagedLog`; older checkpoints then stand.
+        """
         self.journal.sync()
         path, generation, sealed = self.run.path, self.generation, seal(self.run.config)
         seals: dict[str, Any] = {"record": sealed}

@@ -95,11 +95,12 @@ class Progress:
             self.line.start("compiling, then the first generation")
 
     def update(self, generation: int, row: dict[str, Any], seconds: float) -> None:
-        """The generations up to this one took `seconds`; `row` holds the metrics of the last."""
+        """The generations up to this one, since the last call, took `seconds`; `row` holds the
+        metrics of the last. Rates are averaged over some five calls, and the first does not count:
+        programs compile in it."""
         frames, seconds = row["frames"], max(seconds, 1e-9)
         rates = (generation - self.generation) / seconds, (frames - self.frames) / seconds
         self.generation, self.frames = generation, frames
-        # The first dispatch compiles: its rate says nothing about the time left.
         first, self.updates = self.updates == 0, self.updates + 1
         old = 0.0 if self.updates <= 2 else 0.8
         self.generation_rate = old * self.generation_rate + (1 - old) * rates[0]

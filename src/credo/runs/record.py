@@ -161,7 +161,7 @@ def _sizes(env: Any) -> dict[str, Any]:
 
 
 def task_name(env: Any) -> str:
-    """What people call a task: its id, or its class."""
+    """What people call a task: its id, or its class. Of a wrapper, that of the task inside."""
     while getattr(env, "id", None) is None and getattr(env, "env", None) is not None:
         env = env.env
     return getattr(env, "id", None) or type(env).__name__

@@ -68,9 +68,9 @@ def calm() -> Iterator[None]:
             sys.stderr = before[1]
 
 
-def say(text: str, *, to: str = "stderr") -> None:
-    """A line on stderr or stdout, if anybody is there to read it."""
-    stream = Stream(getattr(sys, to))
+def say(text: str) -> None:
+    """A line on stderr, if anybody is there to read it."""
+    stream = Stream(sys.stderr)
     stream.write(text + "\n")
     stream.flush()
 

@@ -78,7 +78,8 @@ class Rows(NamedTuple):
 
 
 class Ring(NamedTuple):
-    """The leaves of one replay buffer by their path in the tree, and the rows it holds."""
+    """The leaves of one replay buffer by their path in the tree, `[capacity, ...]` each, and the
+    rows it holds: from number `oldest` up to `written`, the next one to be written."""
 
     leaves: dict[str, Any]
     oldest: int
@@ -106,7 +107,8 @@ class Ring(NamedTuple):
 
 
 class Stored(NamedTuple):
-    """One leaf of a buffer on disk."""
+    """One leaf of a buffer on disk: its whole `shape`, and of each part the first row, the one
+    behind the last, and the file. Nothing is read before `read`."""
 
     name: str
     dtype: np.dtype

@@ -25,7 +25,11 @@ CHAMPION, BEST = "champion.safetensors", "best.safetensors"
 
 
 class Run:
-    """A run on disk, finished or not. Reading it changes nothing."""
+    """A run on disk, finished or not. Reading it changes nothing.
+
+    `path`: its folder. `config`: its record (see `record`), checked and whole. `trusted`: whether
+    code of somebody's own that it names may be imported.
+    """
 
     def __init__(self, path: str | pathlib.Path, *, trust: bool = False, best: bool = False):
         """`trust`: whether classes and environments of somebody's own may be imported that a run
