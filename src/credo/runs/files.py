@@ -8,13 +8,14 @@ pipe would make its reader wait for ever, and a sparse file may be larger than t
 
 import contextlib
 import errno
+import io
 import json
 import os
 import shutil
 import stat
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 MOST = 64 * 2**20  # bytes that are read at once, unless more is asked for
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -138,7 +139,7 @@ def read_text(path: str | os.PathLike[str], most: int = MOST) -> str:
         ) from None
 
 
-def reading(path: str | os.PathLike[str]) -> BinaryIO:
+def reading(path: str | os.PathLike[str]) -> io.BufferedReader:
     """A regular file, open for reading: never waits, and a link is followed. Raises `OSError`."""
     return open(opened(path, os.O_RDONLY, follow=True), "rb")
 
