@@ -37,7 +37,7 @@ from credo.report import run_page
 from credo.report import sections as report
 from credo.report.rows import Results, Row, Series, concat, read, rows, series, write
 from credo.rollout import evaluate
-from credo.runs import checkpoint, config, log
+from credo.runs import checkpoint, config, files, log
 from credo.runs.store import Run
 
 CHAPTERS = ("5", "6", "td3", "learners")
@@ -57,7 +57,7 @@ def fake(path, algorithm, seed, speed=1.0, **columns):
     """A run of this algorithm that was never trained: the champion is the first draw."""
     path.mkdir(parents=True)
     record = {"algorithm": config.to_tree(algorithm), "seed": seed, "machine": config.machine()}
-    config.write_json(path / "config.json", record | {"budget": {"frames": 1}})
+    files.write_json(path / "config.json", record | {"budget": {"frames": 1}})
     g = np.arange(1, GENERATIONS + 1)
     table = {"frames": FRAMES * g, "champion_score": 10.0 * g + seed, "fitness_max": 1.0 * g}
     table["updates"] = np.full(GENERATIONS, FRAMES if getattr(algorithm, "learners", True) else 0)

@@ -25,7 +25,7 @@ from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.report import run_page as report
 from credo.report.sections import Page
-from credo.runs import config, evaluation, log
+from credo.runs import config, evaluation, files, log
 from credo.runs.loop import train
 from credo.runs.record import RunError
 from credo.runs.store import Run
@@ -40,7 +40,7 @@ def fake(path, algorithm, seed, scores, frames=None):
     path.mkdir(parents=True)
     record = {"algorithm": config.to_tree(algorithm), "seed": seed, "machine": config.machine()}
     record |= {"budget": {"frames": 1000}} if frames else {}
-    config.write_json(path / "config.json", record)
+    files.write_json(path / "config.json", record)
     rows = [
         {
             "generation": g + 1,

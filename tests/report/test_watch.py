@@ -27,7 +27,7 @@ from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team
 from credo.report.films import _maker, _takes, film
 from credo.report.watch import watch
-from credo.runs import checkpoint, config
+from credo.runs import checkpoint, config, files
 from credo.runs.record import RunError
 from credo.runs.store import Run
 from credo.types import TimeStep
@@ -119,7 +119,7 @@ def made(path, env, network=None) -> Run:
     algorithm = Neuroevolution(env, network, population_size=10)
     policy = network.init(*env.sizes, key=jax.random.key(0))
     checkpoint.export_policy(path / "champion.safetensors", policy)
-    config.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
+    files.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
     return Run(path, trust=True)
 
 

@@ -23,7 +23,7 @@ from credo.networks.normalized import Normalized
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Centralized, Team
 from credo.runner import DESCRIPTION, VERSION, Runner
-from credo.runs import checkpoint, config
+from credo.runs import checkpoint, config, files
 from credo.runs.export import export, parts_of
 from credo.runs.policy import Policy
 from credo.runs.record import RunError
@@ -91,7 +91,7 @@ def made(path, env, network, seed=0, action=None, champion=None, **settings) -> 
     task = {name: getattr(env, name) for name in ("obs_size", "action_size", "agents", "discrete")}
     task["actions"] = action and adapters._described(action)
     record = {"algorithm": config.to_tree(algorithm), "seed": seed, "task": task}
-    config.write_json(path / "config.json", record)
+    files.write_json(path / "config.json", record)
     return Run(path, trust=True)
 
 

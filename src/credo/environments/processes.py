@@ -193,6 +193,8 @@ def _wait(worker: int, parent: int, wake: int, grace: float) -> int:
         for pid, status in _ended():
             if pid == worker:
                 return status
+        if deadline is not None and signal.SIGTERM in told:
+            deadline = time.monotonic()  # told twice: at once
         if deadline is None and (signal.SIGTERM in told or os.getppid() != parent):
             deadline = time.monotonic() + grace
             if gone is not None:

@@ -22,6 +22,7 @@ class Stream:
         self._inner = inner  # None where the process was started without one
 
     def write(self, text: str) -> int:
+        """Never raises for want of a reader; characters that the stream has not are escaped."""
         with _unread(self._inner):
             try:
                 self._inner.write(text)
@@ -67,9 +68,9 @@ def calm() -> Iterator[None]:
             sys.stderr = before[1]
 
 
-def say(text: str, *, to: str = "stderr") -> None:
-    """A line on stderr or stdout, if anybody is there to read it."""
-    stream = Stream(getattr(sys, to))
+def say(text: str) -> None:
+    """A line on stderr, if anybody is there to read it."""
+    stream = Stream(sys.stderr)
     stream.write(text + "\n")
     stream.flush()
 

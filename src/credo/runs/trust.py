@@ -75,15 +75,23 @@ def _code(record: Mapping[str, Any], key: bytes) -> str:
 
 
 def _key(*, make: bool) -> bytes | None:
+    """This user's key, made if there is none and it is to be; None, with a warning if it was to be
+    made, if there can be none."""
     path = key_path()
-    if path is None:
-        return _none("this user has no home folder") if make else None
     try:
+        if path is None:
+            raise ValueError("this user has no home folder")
         if make and not path.exists():
             _make(path)
         return _read(path)
     except (OSError, ValueError) as error:
-        return _none(str(error)) if make else None
+        if make:
+            warnings.warn(
+                f"runs made now are not signed, since there is no key for it ({error}): those with "
+                "classes of your own will go on only with --trust",
+                stacklevel=3,
+            )
+        return None
 
 
 def _read(path: pathlib.Path) -> bytes:
@@ -118,11 +126,3 @@ def _make(path: pathlib.Path) -> None:
             os.replace(draft, path)
     finally:
         files.remove(draft)
-
-
-def _none(why: str) -> None:
-    warnings.warn(
-        f"runs made now are not signed, since there is no key for it ({why}): those with classes "
-        "of your own will go on only with --trust",
-        stacklevel=2,
-    )
