@@ -23,14 +23,15 @@ class Family(NamedTuple):
         return [*self.makers, *["none"] * (self.empty and "none" not in self.makers)]
 
     def word(self, value: Any) -> str:
-        """The word for what stands there."""
+        """The word for what stands there; of what has no word, the name of its class."""
         if isinstance(value, tuple):
             return ",".join(map(self.word, value)) or "none"
         words = {path: word for word, path in self.makers.items()}
         return "none" if value is None else words.get(_path(type(value)), type(value).__name__)
 
     def chosen(self, flag: str, words: list[str], old: Any) -> Any:
-        """What the words name; what is there already stays as it is."""
+        """What the words name; a member of the same class that is there already stays as it is,
+        with its settings. A word may name a class of the user's, as package.module:Class."""
         words = [] if words in (["none"], ["None"]) and "none" not in self.makers else words
         there = old if self.many else (old,)
         pairs = itertools.zip_longest(words, there[: len(words)])
@@ -50,14 +51,15 @@ class Family(NamedTuple):
 
 
 def family_of(kind: Any) -> Family | None:
-    """The family of a field's type; None where there is nothing to choose."""
+    """The family of a field's type: what the catalogue lists for its classes, and of one that it
+    does not list the class itself. None where there is nothing to choose."""
     kinds = list(leaves(kind))
     bases = tuple(k for k in kinds if isinstance(k, type) and dataclasses.is_dataclass(k))
     makers: dict[str, str] = {}
     for base in bases:
-        own = {base.__name__.lower(): _path(base)}
         abstract = base.__name__.startswith("Abstract")
-        makers |= CATALOGUE["families"].get(base.__name__, {} if abstract else own)
+        own = {} if abstract else {base.__name__.lower(): _path(base)}
+        makers |= CATALOGUE["families"].get(base.__name__, own)
     family = Family(makers, bases, tuple in kinds, tuple in kinds or types.NoneType in kinds)
     return family if makers and len(family.words) > 1 else None
 

@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 from typing import Any
 
+from .. import require
 from ..runs.ending import say
 from ..runs.options import RunOptions
 from .line import Line
@@ -38,75 +39,71 @@ class Train:
     options: RunOptions = RunOptions()  # noqa: RUF009
 
     def __post_init__(self):
-        if not 0 <= self.seed <= self.seed + max(self.seeds, 1) - 1 < 2**32:
-            last = f" … {self.seed + self.seeds - 1}" if self.seeds > 1 else ""
-            raise ValueError(f"seed is {self.seed}{last}: a seed must lie in 0 … {2**32 - 1}")
-        if self.seeds < 1:
-            raise ValueError(f"seeds is {self.seeds}: it must be at least 1")
+        require_seeds(self.seed, max(self.seeds, 1))
+        require.at_least("seeds", self.seeds, 1)
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """What the catalogue says of the algorithm."""
+        return ALGORITHMS[self.algorithm]
+
+    @property
+    def example(self) -> tuple[str, str]:
+        """A task that the algorithm can learn, and the path of a small one for help."""
+        return CATALOGUE["examples"][self.entry.get("learns", "one agent")]
+
+    def __call__(self, line: Line) -> None:
+        """Train, or show or write the settings; without a task or algorithm, say what is missing.
+        A task that is not ours is checked first."""
+        if self.algorithm and self.algorithm not in ALGORITHMS:
+            fail(f"no algorithm {self.algorithm!r}", self.algorithm, ALGORITHMS)
+        if not (self.task or (line.help and self.algorithm)):
+            if self.algorithm and not line.help:
+                words = f"{self.algorithm} {self.example[0]}"
+                say(f"credo: a task is missing, as in credo train {words}\n")
+            line.end()
+        algorithm = _algorithm(line, self)
+        line.done()
+        from . import settings, tasks
+
+        tasks.require_sound(self.task, algorithm.env)
+        text = settings.written(self, algorithm)
+        if self.save_config:
+            pathlib.Path(self.save_config).write_text(text, "utf-8")
+        if self.print_config:
+            print(text, end="")
+        else:
+            _start(self, algorithm)
 
 
-def run(line: Line) -> None:
-    """Train, or say with which flags."""
-    if files := [values for name, values in line.given if name == "config" and values]:
-        from . import settings
-
-        said = [values for name, values in line.given if name == "trust"]
-        trust = bool(said) and said[-1][:1] in ([], ["True"], ["true"])
-        line.filed = settings.read(files[-1][0], trust=trust)
-        saved = dict(line.filed)
-        words = [*saved.get("algorithm", []), *saved.get("task", [])]
-        line.words, line.used = line.words + words[len(line.words) :], {"algorithm", "task"}
-    command = line.command(Train)
-    if command.algorithm and command.algorithm not in ALGORITHMS:
-        fail(f"no algorithm {command.algorithm!r}", command.algorithm, ALGORITHMS)
-    if not (command.task or (line.help and command.algorithm)):
-        if command.algorithm and not line.help:
-            tasks = {"a team": "rover", "labelled sequences": "sequence-recall"}
-            task = tasks.get(ALGORITHMS[command.algorithm].get("learns", ""), "Hopper-v5")
-            say(f"credo: a task is missing, as in credo train {command.algorithm} {task}\n")
-        line.end()
-    algorithm = _algorithm(line, command)
-    line.done()
-    from . import settings, tasks
-
-    tasks.require_sound(command.task, algorithm.env)
-    text = settings.written(command, algorithm)
-    if command.save_config:
-        pathlib.Path(command.save_config).write_text(text, "utf-8")
-    if command.print_config:
-        print(text, end="")
-    else:
-        _start(command, algorithm)
+def require_seeds(first: int, number: int = 1) -> None:
+    """Raise `ValueError` if one of so many seeds from the first on is not in 0 … 2^32 - 1."""
+    if not 0 <= first <= first + number - 1 < 2**32:
+        last = f" … {first + number - 1}" if number > 1 else ""
+        raise ValueError(f"seed is {first}{last}: a seed must lie in 0 … {2**32 - 1}")
 
 
 def _algorithm(line: Line, command: Train) -> Any:
-    """The algorithm of a task and network, with all that was typed about them."""
+    """The algorithm of a task and network, with all that was typed about them. Without a task, as
+    help may be asked for, the algorithm is that of a small one, whose own flags are not shown."""
     from . import tasks
 
-    entry, word = ALGORITHMS[command.algorithm], command.algorithm
-    module, _, rest = entry["path"].partition(":")
-    cls, build = load(f"{module}:{rest.partition('.')[0]}"), load(entry["path"])
-    if command.preset:
-        presets = entry.get("presets", ())
-        if command.preset not in presets:
-            what = (
-                f"no preset {command.preset!r} of {word}" if presets else f"{word} has no presets"
-            )
-            fail(what, command.preset, presets)
-        build = cls.presets()[command.preset]
-    line.reserved |= {f.name.replace("_", "-") for f in dataclasses.fields(cls)}
+    word, learns = command.algorithm, command.entry.get("learns")
+    build, fields = _builder(word, command.preset)
+    line.reserved |= fields
     line.skipped = {"id"}  # the task is a word
-    example = CATALOGUE["examples"][entry.get("learns", "one agent")]
     try:
-        given = (command.task, command.kwargs, command.rewards)
-        env = tasks.task(*given) if command.task else load(example)()
-        env = line.take(env, "env.")
-        if entry.get("learns") == "a team" and env.agents is None:
+        if command.task:
+            env = line.take(tasks.task(command.task, command.kwargs, command.rewards), "env.")
+        else:
+            env, line.skipped = load(command.example[1])(), {"env"}
+            line.text += f" Flags of a task are shown with it: credo train {word} TASK --help-all."
+        if learns == "a team" and env.agents is None:
             fail(
                 f"{word} trains teams and {command.task} has one agent: give a team (rover, "
                 "simple-spread, mpe2.simple_spread_v3, one of your own), or train erl"
             )
-        network = _network(line, command.network or entry.get("network"), word, env)
+        network = _network(line, command.network or command.entry.get("network"), word, env)
         if command.delayed:
             from ..environments import wrappers
 
@@ -114,6 +111,19 @@ def _algorithm(line: Line, command: Train) -> Any:
         return line.take(build(env, network))
     except ValueError as error:  # a task and an algorithm that do not go together
         fail(str(error))
+
+
+def _builder(word: str, preset: str | None) -> tuple[Any, set[str]]:
+    """What makes the algorithm of a task and a network, and the names of its fields as flags."""
+    entry = ALGORITHMS[word]
+    module, _, name = entry["path"].partition(":")
+    cls, presets = load(f"{module}:{name.partition('.')[0]}"), entry.get("presets", ())
+    if preset and not presets:
+        fail(f"{word} has no presets")
+    if preset and preset not in presets:
+        fail(f"no preset {preset!r} of {word}", preset, presets)
+    fields = {f.name.replace("_", "-") for f in dataclasses.fields(cls)}
+    return cls.presets()[preset] if preset else load(entry["path"]), fields
 
 
 def _network(line: Line, name: str | None, algorithm: str, env: Any) -> Any:
@@ -131,33 +141,39 @@ def _network(line: Line, name: str | None, algorithm: str, env: Any) -> Any:
 
 
 def _start(command: Train, algorithm: Any) -> None:
-    """One run here, or several in processes of their own."""
+    """One run here, or several in processes of their own; then how far each came, and whether it
+    learned anything by gradient."""
     from ..executors import local
     from ..runs import folder, loop
     from ..runs.store import Run
 
-    frames, learns = command.options.frames, getattr(algorithm, "learners", True)
-    flag = next((x for x in ("start_frames", "warmup_frames") if hasattr(algorithm, x)), "")
-    start = getattr(algorithm, flag, -1)
-    if learns and not command.from_ and frames is not None and frames <= start:
-        say(
-            f"credo: note: nothing is learned by gradient in the first {start:,} frames, and this "
-            f"run ends after {frames:,}: give more --frames, or fewer --{flag.replace('_', '-')}"
-        )
     number = command.seed if command.seeds == 1 else "seeds"
     path = pathlib.Path(command.path) if command.path else folder.free_name(algorithm, number)
-    seeds = range(command.seed, command.seed + command.seeds)
-    if len(seeds) == 1:
-        given = {"seed": command.seed, "path": path, "warm_start": command.from_}
-        print(loop.train(algorithm, command.options, **given).summary)
-        return
-    local.run(
-        [
-            local.Job(path / f"seed-{seed}", algorithm, seed, command.options, command.from_)
-            for seed in seeds
-        ],
-        again="the same command" + f" with --path {path}" * (not command.path),
-    )
-    for seed in seeds:
-        print(Run(path / f"seed-{seed}").summary)
-    print(f"compare them: credo report {path}/seed-*")
+    options, start = command.options, command.from_
+    first, late = _warm_up(algorithm)
+    if not start and options.frames is not None and options.frames <= first:
+        say(f"credo: note: {late}")
+    if command.seeds == 1:
+        runs = [loop.train(algorithm, options, seed=command.seed, path=path, warm_start=start)]
+    else:
+        seeds = range(command.seed, command.seed + command.seeds)
+        jobs = [local.Job(path / f"seed-{n}", algorithm, n, options, start) for n in seeds]
+        local.run(jobs, again="the same command" + f" with --path {path}" * (not command.path))
+        runs = [Run(job.path) for job in jobs]
+    for run in runs:
+        print(run.summary)
+        if late and not run.metrics["updates"].any():
+            say(f"credo: no gradient update was made in {run.path}: {late}")
+    if len(runs) > 1:
+        print(f"compare them: credo report {path}/seed-*")
+
+
+def _warm_up(algorithm: Any) -> tuple[int, str]:
+    """The frames before learning by gradient begins, and a line that says so; -1 and "" for an
+    algorithm that does not learn so, or from the first frame on."""
+    for name in ("start_frames", "warmup_frames"):
+        if hasattr(algorithm, name) and getattr(algorithm, "learners", True):
+            frames, flag = getattr(algorithm, name), name.replace("_", "-")
+            told = f"nothing is learned by gradient in the first {frames:,} frames"
+            return frames, f"{told}: give more --frames, or fewer --{flag}"
+    return -1, ""
