@@ -317,9 +317,10 @@ class Node:
         sense."""
         if self.depth >= DEEPEST:
             raise ValueError(f"its networks lie in one another more than {DEEPEST} deep")
-        kind = NETWORKS[self.described["type"]]
-        if kind.team is not None and kind.team != (self.agents is not None):
-            raise ValueError(f"{kind.__name__} cannot act for {self.agents or 1} agents here")
+        kind, team = NETWORKS[self.described["type"]]
+        if team not in (None, self.agents is not None):
+            name = self.described["type"]
+            raise ValueError(f"{name} cannot act for {self.agents or 1} agents here")
         return kind(self)
 
     def claim(self, name: str, *shape: int) -> np.ndarray:
@@ -370,8 +371,6 @@ class MLP:
     """`credo.networks.mlp`: `W_l`, `b_l` of each layer l, `g_l`, `s_l` of its LayerNorm. It has no
     memory."""
 
-    team: ClassVar[bool | None] = False
-
     def __init__(self, node: Node):
         self._hidden, depth = Layers(node, node.config), len(node.config["hidden"])
         self._w = node.claim(f"W_{depth}", node.y, self._hidden.size)
@@ -419,8 +418,6 @@ def _normalize(x: np.ndarray, gain: np.ndarray, shift: np.ndarray) -> np.ndarray
 
 class MMU:
     """`credo.networks.mmu`: Khadka (2019), equations 3.1-3.5. The memory is (y, m)."""
-
-    team: ClassVar[bool | None] = False
 
     def __init__(self, node: Node):
         self.config, shapes = node.config, self._shapes(node.config, node.x, node.y)
@@ -473,7 +470,6 @@ class Recurrent:
     """`credo.networks.recurrent`: Elman RNN, GRU and LSTM. The memory is (h, c), of which c is used
     by the LSTM alone."""
 
-    team: ClassVar[bool | None] = False
     GATES: ClassVar[dict[str, str]] = {"rnn": "h", "gru": "zrh", "lstm": "ifoc"}
 
     def __init__(self, node: Node):
@@ -510,7 +506,6 @@ class Team:
     """`credo.networks.team`: a head for each agent on a trunk, of each one or one for all. The
     memory is that of each head."""
 
-    team: ClassVar[bool | None] = True
     OWN: ClassVar[dict[str, tuple[bool, bool]]] = {  # by what is shared: own trunks, own heads
         "trunk": (False, True),
         "everything": (False, False),
@@ -540,8 +535,6 @@ class Team:
 class DMMU:
     """`credo.networks.dmmu`: agents around one memory, each an MMU or a recurrent network. The
     memory is (what is private to each, m, the generator of random orders)."""
-
-    team: ClassVar[bool | None] = True
 
     def __init__(self, node: Node):
         # The last number says who takes part: 1 acts, 0 is busy, -1 is away.
@@ -579,34 +572,22 @@ class DMMU:
         return pair[::-1] if self._swapped[i] else pair
 
 
-class Around:
-    """A network around one other, whose memory is its own."""
-
-    _inner: Any
-
-    def start(self, random: "np.random.Generator") -> Any:
-        return self._inner.start(random)
-
-
-class Centralized(Around):
+class Centralized:
     """`credo.networks.team`: one network for all agents."""
-
-    team: ClassVar[bool | None] = True
 
     def __init__(self, node: Node):
         self._agents = n = node.agents
         self._inner = node.part(0, "policy", n * node.x, n * node.y)
+        self.start = self._inner.start
 
     def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
         action, memory = self._inner(x.ravel(), memory)
         return action.reshape(self._agents, -1), memory
 
 
-class Normalized(Around):
+class Normalized:
     """`credo.networks.normalized`: observations with mean 0 and standard deviation 1, of each agent
     of a team, clipped to [-10, 10], for the network within."""
-
-    team: ClassVar[bool | None] = None  # that of the network within
 
     def __init__(self, node: Node):
         shape = (node.x,) if node.agents is None else (node.agents, node.x)
@@ -614,14 +595,22 @@ class Normalized(Around):
         if not (self._std > 0).all():
             raise ValueError(f"std is {self._std}: it must be more than 0")
         self._inner = node.part(0, "policy", node.x, node.y, node.agents)
+        self.start = self._inner.start
 
     def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
         return self._inner(np.clip((x - self._mean) / self._std, -10.0, 10.0), memory)
 
 
-NETWORKS: dict[str, Any] = {
-    kind.__name__: kind for kind in (MLP, MMU, Recurrent, Team, DMMU, Centralized, Normalized)
+NETWORKS: dict[str, tuple[Callable[[Node], Any], bool | None]] = {
+    "MLP": (MLP, False),
+    "MMU": (MMU, False),
+    "Recurrent": (Recurrent, False),
+    "Team": (Team, True),
+    "DMMU": (DMMU, True),
+    "Centralized": (Centralized, True),
+    "Normalized": (Normalized, None),
 }
+"""By name in a file; and whether it acts for a team or, False, for one. None: as that within."""
 
 
 # ----------------------------------------------------------------------------------- the file

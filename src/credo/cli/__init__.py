@@ -44,6 +44,7 @@ def _command(argv: list[str]) -> None:
 
 
 def _run(command: str, argv: list[str]) -> None:
+    """Read the words and flags of a command, and call it. Its warnings are lines on stderr."""
     if command not in COMMANDS:
         if command in ALGORITHMS:
             fail(f"{command} is an algorithm: credo train {command} TASK")

@@ -25,8 +25,11 @@ class PolicyOf:
 
     run: str
     _: dataclasses.KW_ONLY
-    best: bool = False  # the policy with the highest test score, not the last generation's
-    trust: bool = False  # the run was made elsewhere and names code of others: import it
+    best: bool = False
+    """Take the policy with the highest test score, instead of the last generation's."""
+    trust: bool = False
+    """Import the code that the run's record names, although the run was made elsewhere: to import a
+    module is to execute it."""
 
     def only(self, command: str) -> Any:
         """The only run of the folder; of several one must be named."""
@@ -46,10 +49,13 @@ class Evaluate(PolicyOf):
     Flags of the task change the task: credo evaluate RUN --depth 101."""
 
     _: dataclasses.KW_ONLY
-    episodes: int | None = None  # fresh ones, at least 1; None: 1000, outside JAX 20
-    seed: int = 0  # 0 to 2^32 - 1, of the episodes
+    episodes: int | None = None
+    """Episodes to play, at least 1. None: 1000, and 20 of a task outside JAX."""
+    seed: int = 0
+    """Seed of the episodes, 0 to 2^32 - 1. They are others than those of training."""
     kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """NAME=VALUE …: what a task of Gymnasium or PettingZoo is made with."""
+    """NAME=VALUE …: what a task of Gymnasium or PettingZoo is made with, such as g=9.8. Values are
+    read as Python: 8, 0.5, False, None, (1, 2); anything else is a string."""
 
     def __post_init__(self):
         require.at_least("episodes", self.episodes, 1)
@@ -91,10 +97,15 @@ class Watch(PolicyOf):
 
     file: str | None = None
     _: dataclasses.KW_ONLY
-    episodes: int = 1  # at least 1, one after the other
-    seed: int = 0  # 0 to 2^32 - 1, of the first episode; the next ones count up
-    fps: float | None = None  # steps shown per second, above 0; None: in real time, of rovers 5
-    size: tuple[int, int] = (480, 480)  # width and height in pixels, where a task lets us choose
+    episodes: int = 1
+    """Episodes to show, at least 1, one after the other."""
+    seed: int = 0
+    """Seed of the first episode, 0 to 2^32 - 1; the next ones count up."""
+    fps: float | None = None
+    """Steps shown per second, above 0. None: in real time; 5 of rovers, 30 where the task
+    does not say."""
+    size: tuple[int, int] = (480, 480)
+    """Width and height of a video in pixels, where the task lets them be chosen."""
 
     def __post_init__(self):
         require.at_least("episodes", self.episodes, 1)
@@ -107,9 +118,8 @@ class Watch(PolicyOf):
         line.done()
         from ..report import watch
 
-        target = pathlib.Path(self.file) if self.file else None
         given = {name: getattr(self, name) for name in ("episodes", "seed", "fps", "size")}
-        print(f"wrote {watch.watch(self.only('watch'), target, **given)}")
+        print(f"wrote {watch.watch(self.only('watch'), self.file, **given)}")
 
 
 @dataclasses.dataclass
@@ -125,7 +135,7 @@ class Export(PolicyOf):
         from ..runs import export
 
         run = self.only("export")
-        target = pathlib.Path(self.file) if self.file else run.path / "policy.safetensors"
+        target = self.file or run.path / "policy.safetensors"
         print(f"policy: {export.export(run, target)}")
         print(f'use it: policy = credo.Runner.load("{target}"); action = policy(observation)')
 
@@ -137,8 +147,11 @@ class Report:
 
     runs: tuple[str, ...]
     _: dataclasses.KW_ONLY
-    output: str | None = None  # the page (or -o); None: report.html in the folder of the runs
-    labels: tuple[str, ...] = ()  # names for the curves, in the order of the runs; none: our own
+    output: pathlib.Path | None = None
+    """File of the page (short: -o). None: report.html in the folder of the runs."""
+    labels: tuple[str, ...] = ()
+    """Names of the curves, one for each, in the order of the runs. None given: their algorithms
+    and tasks."""
 
     def __call__(self, line: Line) -> None:
         """Write the page, and say where. One about several runs belongs to none of them: it goes to
@@ -152,9 +165,8 @@ class Report:
         if len(self.runs) > 1:
             parents = [pathlib.Path(path).absolute().parent for path in self.runs]
             common = os.path.relpath(os.path.commonpath(parents))
-        target = pathlib.Path(self.output or pathlib.Path(common) / "report.html")
-        labels = {"labels": self.labels} if self.labels else {}
-        print(f"page: {run_page.write(runs, target, **labels)}")
+        target = self.output or pathlib.Path(common) / "report.html"
+        print(f"page: {run_page.write(runs, target, labels=self.labels or None)}")
 
 
 @dataclasses.dataclass
@@ -164,7 +176,8 @@ class Check:
     task: str
     _: dataclasses.KW_ONLY
     kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """NAME=VALUE …: what a task of Gymnasium or PettingZoo is made with."""
+    """NAME=VALUE …: what a task of Gymnasium or PettingZoo is made with, such as g=9.8. Values are
+    read as Python: 8, 0.5, False, None, (1, 2); anything else is a string."""
     rewards: tuple[str, ...] = ()
     """Rewards of the task by name, the first is what training maximises; of a team of PettingZoo
     NAME=MODULE:FUNCTION …, rewards of your own. None given: the task's own."""
@@ -196,13 +209,17 @@ class Reproduce:
     budget: Literal["smoke", "quick", "full", "million", "published"] = "quick"
     """smoke: seconds to minutes, proves nothing; quick: minutes; full: hours; some have million and
     published."""
-    runs: int | None = None  # independent runs of each cell, at least 1; None: as the budget says
+    runs: int | None = None
+    """Independent runs of each cell, at least 1. None: as many as the budget says."""
     only: str | None = None
     """Cells whose name has this regular expression, as '2-deep, fsp'; a word that is in none lists
     them. What was measured of other cells stays. None: all."""
-    jobs: int | None = None  # processes, at least 1; None: one per core
-    output: str = "reproduced"  # folder for the page and its data
-    work: str = "runs/reproduce"  # folder for the runs behind them
+    jobs: int | None = None
+    """Processes at a time, at least 1. None: one per core."""
+    output: pathlib.Path = pathlib.Path("reproduced")
+    """Folder for the page and its data."""
+    work: pathlib.Path = pathlib.Path("runs/reproduce")
+    """Folder for the runs behind them."""
 
     def __post_init__(self):
         require.at_least("runs", self.runs, 1)
@@ -215,8 +232,8 @@ class Reproduce:
             fail(f"no experiment {self.experiment!r}", self.experiment, EXPERIMENTS)
         from ..experiments import base
 
-        given = {name: getattr(self, name) for name in ("runs", "only", "jobs")}
-        given |= {name: pathlib.Path(getattr(self, name)) for name in ("output", "work")}
+        names = ("runs", "only", "jobs", "output", "work")
+        given = {name: getattr(self, name) for name in names}
         print(f"page: {base.reproduce(self.experiment, self.budget, **given)}")
 
 

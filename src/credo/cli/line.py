@@ -25,10 +25,14 @@ CHOSEN = ("env", "network", "options")  # by words and flags of the command
 
 
 class Flag(NamedTuple):
-    """A field that can be typed."""
+    """A field that can be typed, or a short name of several.
 
-    name: str  # without dashes
-    path: str  # where it is, "" of a short name
+    `path` leads to the field from the object that was taken, as `learners.0.critic.hidden`; `name`
+    is what to type, without dashes: the path, or what is left of it where that is enough.
+    """
+
+    name: str
+    path: str  # "" of a short name
     kind: Any
     value: Any  # what holds if nothing is typed
     text: str
@@ -73,8 +77,8 @@ class Line:
                 values.append(plain(token))
 
     def command(self, cls: type) -> Any:
-        """The command: fields that are not keyword-only are words, the others flags. The last word
-        may be many, if its type is a tuple. Ends with help if a word is missing."""
+        """The command: fields that are not keyword-only are words, the others flags. Ends with help
+        if a word is missing, and with what is wrong if there are too many or a value cannot be."""
         words = [f for f in dataclasses.fields(cls) if not f.kw_only]
         needed = sum(f.default is dataclasses.MISSING for f in words)
         names = [f"[{f.name.upper()}]" if f.default is None else f.name.upper() for f in words]
@@ -88,18 +92,24 @@ class Line:
         self.skipped = set()
         if len(self.words) < needed:
             self.end()
-        many = tuple in leaves(typing.get_type_hints(cls)[words[-1].name])
-        if len(self.words) > len(words) and not many:
-            most = "one word" if len(words) == 1 else f"{len(words)} words"
-            fail(f"{self.prog} takes {most}, and {self.words[len(words)]!r} is another")
-        placed = {f.name: word for f, word in zip(words, self.words, strict=False)}
-        placed |= {words[-1].name: tuple(self.words[len(words) - 1 :])} if many else {}
-        return dataclasses.replace(command, **placed)
+        return dataclasses.replace(command, **self._placed([f.name for f in words], _kinds(cls)))
+
+    def _placed(self, names: list[str], kinds: dict[str, Any]) -> dict[str, Any]:
+        """The words, by the names of their fields; a last one that is a tuple takes the rest."""
+        placed: dict[str, Any] = dict(zip(names, self.words, strict=False))
+        if tuple in leaves(kinds[names[-1]]):
+            placed[names[-1]] = tuple(self.words[len(names) - 1 :])
+        elif len(self.words) > len(names):
+            most = "one word" if len(names) == 1 else f"{len(names)} words"
+            fail(f"{self.prog} takes {most}, and {self.words[len(names)]!r} is another")
+        return placed
 
     def take(self, value: Any, path: str = "") -> Any:
-        """`value` with what the flags say of its fields, and of the objects inside it. `path`: what
-        stands before the names of its fields, such as `env.`. Raises what the object raises about
-        its values."""
+        """`value` with what the flags say of its fields, and of the objects inside it.
+
+        `path`: what stands before the names of its fields, such as `env.`. Raises what the object
+        raises about its values. An object that no flag changes is returned as it is.
+        """
         kinds, texts, new = _kinds(type(value)), fields.texts(type(value)), {}
         if not path:
             self.reserved |= {f.name.replace("_", "-") for f in dataclasses.fields(value)}
@@ -109,7 +119,7 @@ class Line:
             at, here, kind = path + f.name, getattr(value, f.name), kinds.get(f.name, Any)
             text = texts.get(f.name, "")
             if f.name not in CHOSEN and (family := family_of(kind)):
-                kind = Literal[(*family.words,)]  # pyright: ignore[reportInvalidTypeForm]
+                kind = Literal[(*family.makers,)]  # pyright: ignore[reportInvalidTypeForm]
                 for words in self._given(at, kind, family.word(here), text):
                     here = family.chosen(f.name, split(words), here)
             elif typed(kind):
@@ -150,7 +160,8 @@ class Line:
         return found | {flag.name: flag for flag in self.flags.values()}
 
     def done(self) -> None:
-        """All flags are known: show them if that was asked, and complain of any other."""
+        """All flags are known: end with help if that was asked for, and with what was meant if
+        there is no flag of some name."""
         if self.help:
             self.end()
         known = self.known()
@@ -173,13 +184,13 @@ class Line:
                 print(*[] if title in ("", "options") else [f"\n{title}"], *texts, sep="\n")
         else:
             for flag in [known[name] for name in CATALOGUE["screen"]["first"] if name in known]:
-                print(flag.help(re.split(r"(?<=[\w`)\]])[.:;] ", flag.text)[0]))
+                print(flag.help(re.split(r"(?<=[\w`)\]])(?<!^\w)[.:;] ", flag.text)[0]))
             print(f"\n--help-all lists every field: {len(known)} flags.")
         raise SystemExit(0 if self.help else 2)
 
 
 def shorts(path: str) -> set[str]:
-    """The short names that stand for a field."""
+    """The short names that stand for a field: those with a pattern of its path in the catalogue."""
     table = CATALOGUE["short"].items()
     return {name for name, (_, *paths) in table if any(fnmatch.fnmatch(path, p) for p in paths)}
 

@@ -1,4 +1,4 @@
-"""`credo resume RUN`."""
+"""`credo resume RUN`: to the run's own budget or a larger one, as it was or with other settings."""
 
 import dataclasses
 import pathlib
@@ -20,10 +20,15 @@ class Resume:
     run: str
     _: dataclasses.KW_ONLY
     set: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """FIELD=VALUE, such as learning_rate=1e-4 or gamma=0.95: go on with another setting, which is
-    recorded."""
-    trust: bool = False  # the run was made elsewhere and names code of others: import it
-    without_replay: bool = False  # start with an empty replay buffer, where its files are damaged
+    """FIELD=VALUE, such as learning_rate=1e-4 or gamma=0.95: go on with another setting of the
+    algorithm. Weights, population and replay buffer stay; the run's record says what was changed
+    when. A run that is finished needs a larger budget with it."""
+    trust: bool = False
+    """Import the code that the run's record names, although the run was made elsewhere: to import a
+    module is to execute it."""
+    without_replay: bool = False
+    """Go on with an empty replay buffer if its files are damaged; else a run whose buffer cannot be
+    read is not resumed."""
     options: RunOptions = RunOptions()  # noqa: RUF009
 
     def __call__(self, line: Line) -> None:

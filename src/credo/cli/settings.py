@@ -29,8 +29,11 @@ def add_file(line: Line) -> None:
 
 
 def read(path: str, *, trust: bool) -> list[tuple[str, list[str]]]:
-    """Flags as if they were typed. Tables may be nested: `[learner]`, `gamma = 0.9`. Whoever wrote
-    the file is not who typed its name: without `trust`, what names code of others is refused."""
+    """The settings of a file as names and values of flags, as they are typed.
+
+    Tables may be nested: `[learner]`, `gamma = 0.9`. Whoever wrote the file is not who typed its
+    name: without `trust`, what names code of others is refused, and the command ends.
+    """
     try:
         found = list(_flat(tomllib.loads(pathlib.Path(path).read_text("utf-8")), ""))
     except (OSError, ValueError) as error:

@@ -28,8 +28,12 @@ def task(name: str, kwargs: dict[str, Any], rewards: tuple[str, ...]) -> Any:
 
 
 def with_settings(env: Any, kwargs: dict[str, Any], rewards: tuple[str, ...] = ()) -> Any:
-    """A task that is made with other `kwargs`, those that are not named stay; with other `rewards`:
-    names of a task's own ones, or NAME=MODULE:FUNCTION for a team of PettingZoo."""
+    """A task with other settings, also inside a wrapper.
+
+    **Arguments:** `kwargs`: what Gymnasium or PettingZoo makes it with, by name; those that are not
+    named stay. `rewards`: names of a task's own ones, the first is what training maximises; for a
+    team of PettingZoo NAME=MODULE:FUNCTION, which are added.
+    """
     if not (kwargs or rewards):
         return env
     known, new = {f.name for f in dataclasses.fields(env)}, {}
@@ -47,7 +51,7 @@ def with_settings(env: Any, kwargs: dict[str, Any], rewards: tuple[str, ...] = (
 
 def _named(name: str, kwargs: dict[str, Any]) -> Any:
     """A task by the form of its name: a word of the catalogue, `module:Name`, the module of a team,
-    an id of Gymnasium, or `package:Id-v0` of a package that registers it when it is imported."""
+    or an id of Gymnasium."""
     if name in TASKS:
         return load(TASKS[name]["path"])()
     if re.fullmatch(r"\w+(\.\w+)*:\w+", name):
@@ -60,6 +64,12 @@ def _named(name: str, kwargs: dict[str, Any]) -> Any:
         fail(f"no module {name!r}: a class or function of your own is written {own}")
     if match := re.fullmatch(r"(?:\./)?(\w+)\.py:(\w+)", name):  # a file in place of its module
         fail(f"{name!r} names a file: name its module, {match[1]}:{match[2]}")
+    return _registered(name)
+
+
+def _registered(name: str) -> Any:
+    """A task of Gymnasium's registry; one of a package that registers its own is written
+    package:Id-v0, and the package is imported."""
     import gymnasium
 
     module, _, id = name.rpartition(":")
@@ -94,7 +104,8 @@ def _own(name: str, kwargs: dict[str, Any]) -> Any:
 
 
 def require_sound(name: str, env: Any) -> None:
-    """End with what is wrong with a task that is not ours, before anything is trained on it."""
+    """End with what is wrong with a task that is not ours, before anything is trained on it: one of
+    the user's own is checked, one of a package is opened."""
     if ":" in name:
         if found := problems(env):
             say("\n".join(f"- {problem}" for problem in found))
@@ -107,7 +118,8 @@ def require_sound(name: str, env: Any) -> None:
 
 
 def problems(env: Any) -> list[str]:
-    """What `check_environment` finds; an exception of the task's own code is a problem too."""
+    """What `check_environment` finds, a sentence each. An exception of the task's own code is a
+    problem too."""
     try:
         return checks.check_environment(env)
     except Exception as error:  # the task is the user's code: say where, and what often helps

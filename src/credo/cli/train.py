@@ -1,4 +1,8 @@
-"""`credo train ALGORITHM TASK`."""
+"""`credo train ALGORITHM TASK`.
+
+A task, a network and an algorithm are made of their words, in this order, and each takes the flags
+of its fields before the next is made of it; then one run is trained, or one for each seed.
+"""
 
 import dataclasses
 import pathlib
@@ -20,37 +24,46 @@ class Train:
     algorithm: str = ""
     task: str = ""
     _: dataclasses.KW_ONLY
-    network: str | None = None  # one of `credo list networks`; None: the algorithm's own
-    preset: str | None = None  # other settings, of `credo list presets`; None: the published ones
-    delayed: bool = False  # pay the whole return of an episode at its last step
-    from_: str | None = None  # folder of a run whose policy this one starts from; None: of none
-    seed: int = 0  # 0 to 2^32 - 1; everything random follows from it
-    seeds: int = 1  # runs, at least 1, with this seed and the next ones; one process per core
-    path: str | None = None  # the run's folder; None: runs/ALGORITHM-TASK-SEED
+    network: str | None = None
+    """Network of the policy, one of `credo list networks`; of a team one for each agent. None: the
+    algorithm's own."""
+    preset: str | None = None
+    """Settings to start from, one of `credo list presets`. None: the published ones."""
+    delayed: bool = False
+    """Pay the whole return of an episode at its last step, and nothing before."""
+    from_: str | None = None
+    """Warm start: the folder of a run whose policy this one starts from. Task and network must have
+    the same sizes. None: new weights."""
+    seed: int = 0
+    """Seed, 0 to 2^32 - 1. Everything random follows from it: on the same machine it gives the
+    same run."""
+    seeds: int = 1
+    """Number of runs, at least 1, with --seed and the seeds after it. Several have a process each,
+    one per core at a time."""
+    path: pathlib.Path | None = None
+    """Folder of the run, new or empty; of several runs the folder of theirs. None:
+    runs/ALGORITHM-TASK-SEED."""
     kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """NAME=VALUE …: what a task of Gymnasium or PettingZoo is made with."""
+    """NAME=VALUE …: what a task of Gymnasium or PettingZoo is made with, such as g=9.8. Values are
+    read as Python: 8, 0.5, False, None, (1, 2); anything else is a string."""
     rewards: tuple[str, ...] = ()
     """Rewards of the task by name, the first is what training maximises; of a team of PettingZoo
     NAME=MODULE:FUNCTION …, rewards of your own. None given: the task's own."""
-    config: str | None = None  # TOML file with any of these settings; what is typed comes first
-    save_config: str | None = None  # TOML file to write all settings to; None: none
-    print_config: bool = False  # print all settings as TOML and train nothing
-    trust: bool = False  # the file of --config names code of others: import it
+    config: str | None = None
+    """TOML file with any of these settings, as --save-config writes them. What is typed overrides
+    it."""
+    save_config: pathlib.Path | None = None
+    """TOML file to write all settings to, for --config. None: no file."""
+    print_config: bool = False
+    """Print all settings as TOML, and train nothing."""
+    trust: bool = False
+    """Import the code that the file of --config names. Without this such a file is refused: to
+    import a module is to execute it."""
     options: RunOptions = RunOptions()  # noqa: RUF009
 
     def __post_init__(self):
         require_seeds(self.seed, max(self.seeds, 1))
         require.at_least("seeds", self.seeds, 1)
-
-    @property
-    def entry(self) -> dict[str, Any]:
-        """What the catalogue says of the algorithm."""
-        return ALGORITHMS[self.algorithm]
-
-    @property
-    def example(self) -> tuple[str, str]:
-        """A task that the algorithm can learn, and the path of a small one for help."""
-        return CATALOGUE["examples"][self.entry.get("learns", "one agent")]
 
     def __call__(self, line: Line) -> None:
         """Train, or show or write the settings; without a task or algorithm, say what is missing.
@@ -59,7 +72,7 @@ class Train:
             fail(f"no algorithm {self.algorithm!r}", self.algorithm, ALGORITHMS)
         if not (self.task or (line.help and self.algorithm)):
             if self.algorithm and not line.help:
-                words = f"{self.algorithm} {self.example[0]}"
+                words = f"{self.algorithm} {_examples(self.algorithm)[0]}"
                 say(f"credo: a task is missing, as in credo train {words}\n")
             line.end()
         algorithm = _algorithm(line, self)
@@ -69,7 +82,7 @@ class Train:
         tasks.require_sound(self.task, algorithm.env)
         text = settings.written(self, algorithm)
         if self.save_config:
-            pathlib.Path(self.save_config).write_text(text, "utf-8")
+            self.save_config.write_text(text, "utf-8")
         if self.print_config:
             print(text, end="")
         else:
@@ -84,33 +97,46 @@ def require_seeds(first: int, number: int = 1) -> None:
 
 
 def _algorithm(line: Line, command: Train) -> Any:
-    """The algorithm of a task and network, with all that was typed about them. Without a task, as
-    help may be asked for, the algorithm is that of a small one, whose own flags are not shown."""
-    from . import tasks
-
-    word, learns = command.algorithm, command.entry.get("learns")
+    """The algorithm of a task and network, with all that was typed about them. What they raise
+    about their settings, or about one another, ends the command."""
+    word = command.algorithm
     build, fields = _builder(word, command.preset)
     line.reserved |= fields
-    line.skipped = {"id"}  # the task is a word
     try:
-        if command.task:
-            env = line.take(tasks.task(command.task, command.kwargs, command.rewards), "env.")
-        else:
-            env, line.skipped = load(command.example[1])(), {"env"}
-            line.text += f" Flags of a task are shown with it: credo train {word} TASK --help-all."
-        if learns == "a team" and env.agents is None:
-            fail(
-                f"{word} trains teams and {command.task} has one agent: give a team (rover, "
-                "simple-spread, mpe2.simple_spread_v3, one of your own), or train erl"
-            )
-        network = _network(line, command.network or command.entry.get("network"), word, env)
+        env = _task(line, command)
+        network = _network(line, command.network or ALGORITHMS[word].get("network"), word, env)
         if command.delayed:
             from ..environments import wrappers
 
             env = wrappers.delayed(env)
         return line.take(build(env, network))
-    except ValueError as error:  # a task and an algorithm that do not go together
+    except ValueError as error:
         fail(str(error))
+
+
+def _task(line: Line, command: Train) -> Any:
+    """The task, with its flags. Where none is named, as help may be asked for without, it is a
+    small one whose flags are not shown."""
+    from . import tasks
+
+    word = command.algorithm
+    if not command.task:
+        line.skipped = {"env"}
+        line.text += f" Flags of a task are shown with it: credo train {word} TASK --help-all."
+        return load(_examples(word)[1])()
+    line.skipped = {"id"}  # the task is a word
+    env = line.take(tasks.task(command.task, command.kwargs, command.rewards), "env.")
+    if ALGORITHMS[word].get("learns") == "a team" and env.agents is None:
+        fail(
+            f"{word} trains teams and {command.task} has one agent: give a team (rover, "
+            "simple-spread, mpe2.simple_spread_v3, one of your own), or train erl"
+        )
+    return env
+
+
+def _examples(word: str) -> tuple[str, str]:
+    """The name of a task that an algorithm can learn, and where a small one for help is."""
+    return CATALOGUE["examples"][ALGORITHMS[word].get("learns", "one agent")]
 
 
 def _builder(word: str, preset: str | None) -> tuple[Any, set[str]]:
@@ -148,7 +174,7 @@ def _start(command: Train, algorithm: Any) -> None:
     from ..runs.store import Run
 
     number = command.seed if command.seeds == 1 else "seeds"
-    path = pathlib.Path(command.path) if command.path else folder.free_name(algorithm, number)
+    path = command.path or folder.free_name(algorithm, number)
     options, start = command.options, command.from_
     first, late = _warm_up(algorithm)
     if not start and options.frames is not None and options.frames <= first:

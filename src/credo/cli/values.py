@@ -28,7 +28,8 @@ def leaves(kind: Any) -> Iterator[Any]:
 
 
 def typed(kind: Any) -> bool:
-    """Whether values of a type can be typed."""
+    """Whether values of a type can be typed: numbers, words, yes or no, paths, choices, tuples of
+    these, and settings by name."""
     return dict in leaves(kind) or all(k in TYPED for k in leaves(kind))
 
 
@@ -49,6 +50,7 @@ def read(name: str, kind: Any, words: list[str], old: Any, rest: list[str]) -> A
 
 
 def _by_type(name: str, kind: Any, words: list[str]) -> Any:
+    """The value of a plain type, of a tuple of them, or one of a Literal."""
     import tyro
 
     try:
