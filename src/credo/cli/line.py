@@ -198,13 +198,12 @@ def shorts(path: str) -> set[str]:
 def _defaults(flags: list[Flag]) -> str:
     """What holds for the fields of a short name: one value, or several with the names of the fields
     where these differ, as in `actor-lr 5e-05, critic-lr 0.0005`."""
-    found: dict[str, dict[str, None]] = {}  # values in order, by the fields' last names
-    for flag in flags:
-        found.setdefault(flag.name.rpartition(".")[2], {})[flag.shown] = None
-    told = {name: " or ".join(values) for name, values in found.items()}
-    if len(set(told.values())) == 1:
-        return next(iter(told.values()))
-    return ", ".join(f"{name} {values}" for name, values in told.items())
+    lasts = [flag.name.rpartition(".")[2] for flag in flags]
+    values = list(dict.fromkeys(flag.shown for flag in flags))
+    if len(values) == 1 or len(set(lasts)) == 1:
+        return " or ".join(values)
+    named = (f"{last} {flag.shown}" for last, flag in zip(lasts, flags, strict=True))
+    return ", ".join(dict.fromkeys(named))
 
 
 def _kinds(cls: type) -> dict[str, Any]:
