@@ -14,7 +14,7 @@ from credo.report.styles import Look
 
 
 def svg(item, dark=False) -> str:
-    return figures.picture(item, dark).svg
+    return figures.picture(item, styles.DARK if dark else styles.LIGHT).svg
 
 
 def test_text_of_a_figure_is_text_in_a_generic_font():
@@ -39,8 +39,9 @@ def test_dark_and_light_differ_in_colour_alone():
 
 
 def drawn(item, dark=False):
-    with matplotlib.rc_context(styles.STYLE):
-        canvas = figures.draw(item, styles.DARK if dark else styles.LIGHT)
+    theme = styles.DARK if dark else styles.LIGHT
+    with matplotlib.rc_context(theme.rc):
+        canvas = figures.draw(item, theme)
         canvas.draw_without_rendering()
     return canvas
 
@@ -131,14 +132,14 @@ def test_methods_that_are_compared_differ_in_colour():
 
 def test_looks_of_a_page_are_those_of_its_figures():
     looks = {"depth 2": Look(5, 1), "depth 3": Look(3, 0)}
-    with matplotlib.rc_context(styles.STYLE):
+    with matplotlib.rc_context(styles.LIGHT.rc):
         lines = figures.draw(figure(), styles.LIGHT, looks).axes[0].lines
     assert [lines[i].get_color() for i in (4, 9)] == [styles.LIGHT.curves[i] for i in (5, 3)]
 
 
 def test_tips_tell_values_and_where_the_axes_are():
     item = figure(curves=[Curve("a", [1, 2], [[0.0, -0.5], [1.0, np.nan]])])
-    tips = figures.picture(item).tips
+    tips = figures.picture(item, styles.LIGHT).tips
     assert tips["curves"][0]["x"] == [1.0, 2.0]
     assert tips["curves"][0]["text"] == ["0.5 [0, 1]", ""]
     left, top, width, height = tips["box"]
@@ -147,7 +148,7 @@ def test_tips_tell_values_and_where_the_axes_are():
     low, high = tips["x"]
     assert low < 1
     assert high > 2
-    cells = figures.picture(heat_map()).tips
+    cells = figures.picture(heat_map(), styles.LIGHT).tips
     assert (cells["rows"][0], cells["columns"][1]) == ("cell a", "step 2")
     assert cells["values"][0][:2] == ["-1", "-0.7857"]
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from samples import HOSTILE, figure, heat_map, tracks
 
-from credo.report import statistics
-from credo.report.pages import groups, markdown, markdown_text, render, shown, write
+from credo.report import tables
+from credo.report.markup import markdown_text
+from credo.report.pages import markdown, render, write
 from credo.report.sections import (
     SMOKE,
     Curve,
@@ -26,6 +27,7 @@ from credo.report.sections import (
     Track,
 )
 from credo.report.styles import STATIC
+from credo.report.tables import shown
 
 
 class Reader(HTMLParser):
@@ -195,17 +197,17 @@ def test_a_summary_tells_every_seed_and_its_column_what_it_is():
     assert f'title="{every}"' in html
     assert '<th scope="col" class="number">share</th>' in html
     assert "<small>0.100 … 0.600, n = 6</small>" in html
-    assert statistics.NOTE.format(centre="mean") in html
+    assert tables.NOTE.format(centre="mean") in html
 
 
 def test_interval_of_a_summary_is_known_where_all_resamples_can_be_counted():
     # All 3125 resamples of five values: the quantiles of their means.
     x = np.array([0.1, 0.4, 0.5, 0.9, 1.7])
     every = x[np.stack(np.meshgrid(*[range(5)] * 5)).reshape(5, -1)].mean(axis=0)
-    value, low, high = statistics.centred(x)
+    value, low, high = tables.centred(x)
     assert value == pytest.approx(0.72)
     np.testing.assert_allclose([low, high], np.quantile(every, [0.025, 0.975]), atol=0.03)
-    assert np.isnan(statistics.centred([0.5])[1:]).all()
+    assert np.isnan(tables.centred([0.5])[1:]).all()
 
 
 def test_a_banner_stands_before_everything(tmp_path):
@@ -246,7 +248,6 @@ def test_curves_of_one_label_look_alike_in_all_figures_of_a_page():
 def test_neighbouring_figures_stand_together():
     html = render(Page("p", "", "", [figure(), figure(), Text("t", ["x"]), figure()]))
     assert re.findall(r'<div class="(figures[^"]*)">', html) == ["figures", "figures alone"]
-    assert groups([]) == []
 
 
 def test_markdown_has_tables_and_pictures_beside_it(tmp_path):

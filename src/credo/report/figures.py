@@ -1,11 +1,11 @@
-"""Figures of a page drawn with matplotlib: SVG for pages, PNG for the rest."""
+"""Figures of a page drawn with matplotlib, as SVG that stands in a page or in a file."""
 
 import io
+import itertools
 import math
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from html import escape
 from typing import Any, NamedTuple
@@ -25,9 +25,9 @@ from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatt
 from matplotlib.transforms import offset_copy
 from numpy.typing import NDArray
 
-from . import statistics
 from .sections import Curve, Figure, HeatMap, Reference, Tracks
-from .styles import DARK, DASHES, LIGHT, STYLE, Look, Theme, assign
+from .styles import DASHES, Look, Theme, assign
+from .tables import CENTRES, centred
 
 Floats = NDArray[np.float64]
 Plot = Figure | HeatMap | Tracks
@@ -52,28 +52,38 @@ class Picture(NamedTuple):
     tips: dict[str, Any] | None
 
 
+class Sampled(NamedTuple):
+    """What is drawn of a curve: `x`, `centre`, `low`, `high` `[points]`, `runs[seeds, points]`."""
+
+    x: Floats
+    runs: Floats
+    centre: Floats
+    low: Floats
+    high: Floats
+
+
 def picture(
-    figure: Plot,
-    dark: bool = False,
-    *,
-    prefix: str = "",
-    looks: Looks | None = None,
-    legend: bool = True,
+    figure: Plot, theme: Theme, *, prefix: str = "", looks: Looks | None = None, legend: bool = True
 ) -> Picture:
     """The figure, without its title, as an `<svg>` element that scales with its box.
 
-    Text stays text. Every id begins with `prefix`: several figures in one page need different
-    ones, or their clip paths are mixed up. The background is transparent. `looks`: of curves by
-    their label, as in the other figures of the page; None: of this figure alone. `legend`: whether
-    the picture has one; that of tracks always has.
+    Text stays text, and the background is transparent.
+
+    **Arguments:**
+
+    - `prefix`: of every id; several figures in one page need different ones, or their clip paths
+      are mixed up.
+    - `looks`: of curves by their label, as in the other figures of the page; None: of this figure
+      alone.
+    - `legend`: whether the picture has one; that of tracks always has.
     """
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(theme.rc):
         text = io.StringIO()
-        canvas = draw(figure, DARK if dark else LIGHT, looks, legend)
+        canvas = draw(figure, theme, looks, legend)
         canvas.savefig(text, format="svg", transparent=True)
-        return Picture(
-            inline(text.getvalue(), description(figure), prefix), tips(figure, canvas.axes[0])
-        )
+    return Picture(
+        inline(text.getvalue(), description(figure), prefix), tips(figure, canvas.axes[0])
+    )
 
 
 # ------------------------------------------------------------------------------- what it says
@@ -90,7 +100,7 @@ def note(figure: Plot) -> str:
     parts = ["One run per line." if figure.joined else "One run per point."]
     if seeds[-1] > 1:
         count = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
-        centre = statistics.CENTRES[figure.centre][1]
+        centre = CENTRES[figure.centre][1]
         band, each = ("Band", "Thin lines") if figure.joined else ("Bars", "Dots")
         parts = [
             f"{centre.capitalize()} over {count} runs. {band}: its 95 % bootstrap interval. "
@@ -210,54 +220,51 @@ def compact(tag: str, prefix: str) -> str:
 
 
 def draw(figure: Plot, theme: Theme, looks: Looks | None = None, legend: bool = True) -> Canvas:
-    """The figure on a canvas of its own, with no title. Arguments as of `picture`."""
+    """The figure on a canvas of its own, with no title. Arguments as of `picture`, which sets the
+    theme's settings of matplotlib around it."""
     canvas = Canvas(figsize=(WIDTH, HEIGHT), layout="constrained")
     FigureCanvasAgg(canvas)  # measures text; saving as SVG brings its own
     axes = canvas.add_subplot()
-    axes.spines[["left", "bottom"]].set_color(theme.muted)
-    axes.tick_params(color=theme.muted, labelcolor=theme.ink)
-    axes.set_xlabel(textwrap.fill(figure.x_label, 54), color=theme.ink)
-    axes.set_ylabel(textwrap.fill(figure.y_label, 34), color=theme.ink)
+    axes.set_xlabel(textwrap.fill(figure.x_label, 54))
+    axes.set_ylabel(textwrap.fill(figure.y_label, 34))
     if isinstance(figure, HeatMap):
         draw_heat_map(canvas, axes, figure, theme)
-        return canvas
-    if isinstance(figure, Tracks):
-        handles = draw_tracks(canvas, axes, figure, theme)
+    elif isinstance(figure, Tracks):
+        add_legend(canvas, draw_tracks(canvas, axes, figure, theme))
     else:
-        handles = draw_curves(canvas, axes, figure, theme, looks)
-        legend = legend and any(curve.label.strip() for curve in figure.curves)
-    if legend or isinstance(figure, Tracks):
-        add_legend(canvas, handles, theme)
-    if isinstance(figure, Figure):
+        lines = draw_curves(canvas, axes, figure, theme, looks)
+        if legend:
+            named = zip(lines, figure.curves, strict=True)
+            add_legend(canvas, [line for line, curve in named if curve.label.strip()])
         label_references(canvas, axes, figure.references, theme)
     return canvas
 
 
 def draw_curves(
     canvas: Canvas, axes: Axes, figure: Figure, theme: Theme, looks: Looks | None
-) -> list[Artist]:
-    """All curves and levels; what stands for the named ones in the legend."""
-    looks = assign(curve.label for curve in figure.curves) if looks is None else looks
+) -> list[Line2D]:
+    """All curves and levels; the line of each curve."""
+    looks = looks or assign(curve.label for curve in figure.curves)
     together = coinciding(figure)
-    lines: list[Artist] = []
+    lines: list[Line2D] = []
     for i, curve in enumerate(figure.curves):
-        inside = [len(group) - 1 - group.index(i) for group in together if i in group]
+        # Of curves that coincide each is drawn inside the one before; dots stand beside others'.
+        inside = sum(len(group) - 1 - group.index(i) for group in together if i in group)
         shift = 3.0 * (i - (len(figure.curves) - 1) / 2)  # points
-        look = Drawing(
-            color=theme.curves[looks[curve.label].color],
-            dashes=DASHES[looks[curve.label].dash],
-            # Of curves that coincide each is drawn inside the one before.
-            width=LINE + 2.0 * sum(inside),
-            transform=offset_copy(axes.transData, fig=canvas, x=shift, units="points"),
+        beside = offset_copy(axes.transData, fig=canvas, x=shift, units="points")
+        place = {} if figure.joined else {"transform": beside}
+        artists = draw_curve(
+            axes, curve, figure, theme, looks[curve.label], LINE + 2.0 * inside, place
         )
-        lines.append(draw_curve(axes, i, curve, figure, look))
-    axes.grid(axis="y", color=theme.grid)
+        for count, artist in enumerate(artists):
+            artist.set_gid(f"curve-{i}-{count}")
+        lines.append(artists[-1])
+    axes.grid(axis="y")
     axes.margins(x=0.02)
     scale(axes, figure)
     for line in figure.references:
         axes.axhline(line.value, color=theme.muted, linewidth=1, dashes=(4, 3), zorder=1.5)
-    named = zip(lines, figure.curves, strict=True)
-    return [line for line, curve in named if curve.label.strip()]
+    return lines
 
 
 def scale(axes: Axes, figure: Figure) -> None:
@@ -283,61 +290,54 @@ def scale(axes: Axes, figure: Figure) -> None:
     shorten_ticks(axes.yaxis)
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """How one curve is drawn. `transform`: beside the others, where runs are dots."""
-
-    color: str
-    dashes: tuple[float, ...]
-    width: float  # points
-    transform: Any
-
-    @property
-    def pattern(self) -> list[float]:
-        """The dashes in widths of this line, as long as those of any other."""
-        return [x * LINE / self.width for x in self.dashes]
-
-
-def draw_curve(axes: Axes, index: int, curve: Curve, figure: Figure, look: Drawing) -> Line2D:
-    """Runs, interval and centre of one curve, whose ids begin with `curve-index-`; the line that
-    stands for it in the legend."""
+def draw_curve(
+    axes: Axes,
+    curve: Curve,
+    figure: Figure,
+    theme: Theme,
+    look: Look,
+    width: float,
+    place: Mapping[str, Any],
+) -> list[Any]:
+    """Runs, interval and, last, the centre of one curve, `width` points wide; dots at `place`."""
     shown = sampled(curve, figure.centre, figure.log_x, drawn_points(figure))
-    several = sum(np.shape(other.runs)[0] for other in figure.curves) > 20
+    color = theme.curves[look.color]
+    artists: list[Any] = []
+    if len(shown.runs) > 1:
+        artists = (draw_lines if figure.joined else draw_dots)(axes, shown, figure, color, place)
     few = np.isfinite(shown.centre).sum() <= FEW_POINTS
-    marker = {"marker": "o", "ms": 2.0 + look.width} if few else {}
-    artists: list[Artist] = []
-    if len(shown.runs) > 1 and figure.joined:
-        thin: dict[str, Any] = {"lw": 0.6, "alpha": 0.2 if several else 0.35, "zorder": 2}
-        artists += axes.plot(shown.x, shown.runs.T, color=look.color, **thin)
-        band: dict[str, Any] = {"color": look.color, "alpha": 0.18, "lw": 0, "zorder": 2.5}
-        artists.append(axes.fill_between(shown.x, shown.low, shown.high, **band))
-    beside = {} if figure.joined else {"transform": look.transform}
-    if len(shown.runs) > 1 and not figure.joined:
-        dots: dict[str, Any] = {"lw": 0, "marker": "o", "mew": 0, "ms": 3, "alpha": 0.45}
-        artists += axes.plot(shown.x, shown.runs.T, color=look.color, zorder=2, **dots, **beside)
-        bars = {"colors": look.color, "lw": 1.2, "zorder": 2.5}
-        artists.append(axes.vlines(shown.x, shown.low, shown.high, **bars, **beside))
-    (line,) = axes.plot(
-        *(shown.x, shown.centre),
-        **{"color": look.color, "lw": look.width, "dashes": look.pattern, "zorder": 3, **marker},
-        **({} if figure.joined else {"alpha": 0.9}),
-        **beside,
-        label=textwrap.fill(curve.label, 56),
-    )
-    for count, artist in enumerate([*artists, line]):
-        artist.set_gid(f"curve-{index}-{count}")
-    return line
+    style: dict[str, Any] = {"marker": "o", "ms": 2.0 + width} if few else {}
+    style |= {} if figure.joined else {"alpha": 0.9}
+    # Dashes are in widths of the line, and as long as those of any other.
+    dashes = [x * LINE / width for x in DASHES[look.dash]]
+    label = textwrap.fill(curve.label, 56)
+    style |= {"color": color, "lw": width, "dashes": dashes, "label": label, "zorder": 3}
+    return [*artists, *axes.plot(shown.x, shown.centre, **style, **place)]
 
 
-@dataclass(frozen=True)
-class Sampled:
-    """What is drawn of a curve: `x`, `centre`, `low`, `high` `[points]`, `runs[seeds, points]`."""
+def draw_lines(
+    axes: Axes, shown: Sampled, figure: Figure, color: str, place: Mapping[str, Any]
+) -> list[Artist]:
+    """A thin line for each run, and the band of their interval."""
+    several = sum(np.shape(other.runs)[0] for other in figure.curves) > 20
+    thin: dict[str, Any] = {"lw": 0.6, "alpha": 0.2 if several else 0.35, "zorder": 2}
+    band: dict[str, Any] = {"alpha": 0.18, "lw": 0, "zorder": 2.5}
+    return [
+        *axes.plot(shown.x, shown.runs.T, color=color, **thin, **place),
+        axes.fill_between(shown.x, shown.low, shown.high, color=color, **band, **place),
+    ]
 
-    x: Floats
-    runs: Floats
-    centre: Floats
-    low: Floats
-    high: Floats
+
+def draw_dots(
+    axes: Axes, shown: Sampled, figure: Figure, color: str, place: Mapping[str, Any]
+) -> list[Artist]:
+    """A dot for each run, and a bar for their interval."""
+    dots: dict[str, Any] = {"lw": 0, "marker": "o", "mew": 0, "ms": 3, "alpha": 0.45}
+    bars: dict[str, Any] = {"lw": 1.2, "zorder": 2.5}
+    return [
+        *axes.plot(shown.x, shown.runs.T, color=color, zorder=2, **dots, **place),
+        axes.vlines(shown.x, shown.low, shown.high, colors=color, **bars, **place),
+    ]
 
 
 def drawn_points(figure: Figure) -> int:
@@ -361,7 +361,7 @@ def sampled(curve: Curve, centre: str, log_x: bool, points: int) -> Sampled:
         chosen = np.union1d(chosen, [0, len(x) - 1])
         x, runs = x[chosen], runs[:, chosen]
     runs = np.where(np.isfinite(runs), runs, np.nan)
-    return Sampled(x, runs, *statistics.centred(runs, centre, RESAMPLES))
+    return Sampled(x, runs, *centred(runs, centre, RESAMPLES))
 
 
 def shorten_ticks(axis: Axis, always: bool = False) -> None:
@@ -371,23 +371,12 @@ def shorten_ticks(axis: Axis, always: bool = False) -> None:
         axis.set_major_formatter(EngFormatter(sep=""))
 
 
-def add_legend(canvas: Canvas, handles: Sequence[Artist], theme: Theme) -> None:
+def add_legend(canvas: Canvas, handles: Sequence[Artist]) -> None:
     """A legend below the axes, in as many columns as fit; the canvas grows by its height."""
-    if not handles:
-        return
     for most in range(min(len(handles), 4), 0, -1):
         rows = math.ceil(len(handles) / most)
         columns = math.ceil(len(handles) / rows)
-        legend = canvas.legend(
-            handles=handles,
-            ncols=columns,
-            loc="outside lower center",
-            frameon=False,
-            labelcolor=theme.ink,
-            handlelength=2.6,
-            columnspacing=1.4,
-            borderpad=0,
-        )
+        legend = canvas.legend(handles=handles, ncols=columns, loc="outside lower center")
         extent = legend.get_window_extent()
         if columns == 1 or extent.width <= 0.96 * canvas.bbox.width:
             canvas.set_figheight(canvas.get_figheight() + extent.height / canvas.dpi)
@@ -402,27 +391,12 @@ def label_references(
     lines = sorted(references, key=lambda line: line.value)
     bottom, top = axes.get_ylim()
     ends = [(line.value - bottom) / (top - bottom) for line in lines]
-    leader = {
-        "arrowstyle": "-",
-        "color": theme.muted,
-        "linewidth": 0.8,
-        "shrinkA": 0,
-        "shrinkB": 0,
-        "relpos": (0.0, 0.5),  # it ends at the left of the name, not in the middle of it
-    }
+    leader = {"arrowstyle": "-", "color": theme.muted, "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0}
+    leader["relpos"] = (0.0, 0.5)  # it ends at the left of the name, not in the middle of it
+    style: dict[str, Any] = {"va": "center", "fontsize": 9, "color": theme.muted}
+    style |= {"xycoords": "axes fraction", "annotation_clip": False, "arrowprops": leader}
     labels = [
-        axes.annotate(
-            textwrap.fill(line.label, 15),
-            xy=(1.0, end),
-            xytext=(1.05, end),
-            xycoords="axes fraction",
-            textcoords="axes fraction",
-            va="center",
-            fontsize=9,
-            color=theme.muted,
-            annotation_clip=False,
-            arrowprops=leader,
-        )
+        axes.annotate(textwrap.fill(line.label, 15), (1.0, end), (1.05, end), **style)
         for line, end in zip(lines, ends, strict=True)
     ]
     canvas.draw_without_rendering()
@@ -463,7 +437,7 @@ def draw_heat_map(canvas: Canvas, axes: Axes, figure: HeatMap, theme: Theme) -> 
     scale = np.linspace(low, high, 256)[:, None]
     bar.ax.imshow(scale, origin="lower", extent=(0.0, 1.0, low, high), **look)
     bar.outline.set(edgecolor=theme.grid, linewidth=0.8)  # type: ignore[operator]
-    bar.ax.tick_params(color=theme.muted, labelcolor=theme.ink, length=3)
+    bar.ax.tick_params(length=3)
     shorten_ticks(bar.ax.yaxis)
     label_cells(canvas, axes, figure, height)
 
@@ -474,30 +448,19 @@ def draw_tracks(canvas: Canvas, axes: Axes, figure: Tracks, theme: Theme) -> lis
     cell = 3.9 / columns  # inches; about what the axes have
     height = float(np.clip(rows * max(cell, 0.24), 1.3, 4.0))
     canvas.set_size_inches(WIDTH, height + 0.6)
-    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
-    axes.spines[:].set(visible=True, color=theme.grid)
-    axes.set_xticks(np.arange(0.5, columns - 1), minor=True)
-    axes.set_yticks(np.arange(0.5, rows - 1), minor=True)
-    axes.tick_params(which="minor", length=0)
-    axes.grid(which="minor", color=theme.grid, linewidth=0.7)
-    axes.set_axisbelow(True)
-    for at in figure.breaks:
-        axes.axvline(at - 0.5, color=theme.ink, linewidth=1.2, zorder=2.5)
+    draw_cells(axes, figure, theme)
     # Everybody has a place of their own in a cell: who are in one cell do not hide each other.
-    n = len(figure.tracks)
-    room = {wide: min(cell / wide, height / rows / -(-n // wide)) for wide in range(n, 0, -1)}
-    wide = max(room, key=room.__getitem__)
+    n, row = len(figure.tracks), height / rows
+    wide = max(range(n, 0, -1), key=lambda wide: min(cell / wide, row / -(-n // wide)))
     high = -(-n // wide)
-    size = min(0.8 * 72 * room[wide], 9.0)
-    handles, learners = draw_goals(axes, figure, theme), 0
+    size = min(0.8 * 72 * min(cell / wide, row / high), 9.0)
+    handles = draw_goals(axes, figure, theme)
+    colors = itertools.cycle(theme.curves[i] for i in WALKERS)
+    learners = zip(itertools.cycle(MARKERS), colors, strict=False)
     for i, track in enumerate(figure.tracks):
         x = np.arange(columns) + (i % wide + 0.5) / wide - 0.5
         y = np.asarray(track.rows) + (i // wide + 0.5) / high - 0.5
-        marker, color = "X", theme.ink
-        if not track.scripted:
-            marker = MARKERS[learners % len(MARKERS)]
-            color = theme.curves[WALKERS[learners % len(WALKERS)]]
-            learners += 1
+        marker, color = ("X", theme.ink) if track.scripted else next(learners)
         look: dict[str, Any] = {"marker": marker, "color": color, "mec": theme.page}
         axes.plot(x, y, **look, lw=0.8, alpha=0.3, ms=0, zorder=3)
         axes.plot(x, y, **look, lw=0, ms=size, mew=0.12 * size, zorder=4)
@@ -505,6 +468,19 @@ def draw_tracks(canvas: Canvas, axes: Axes, figure: Tracks, theme: Theme) -> lis
         handles.append(Line2D([], [], **look, lw=0, ms=7, mew=0.7, label=label))
     label_cells(canvas, axes, figure, height)
     return handles
+
+
+def draw_cells(axes: Axes, figure: Tracks, theme: Theme) -> None:
+    """The grid of tracks, row 0 at the top, and a line at each break."""
+    rows, columns = len(figure.row_labels), len(figure.column_labels)
+    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
+    axes.spines[:].set(visible=True, color=theme.grid)
+    axes.set_xticks(np.arange(0.5, columns - 1), minor=True)
+    axes.set_yticks(np.arange(0.5, rows - 1), minor=True)
+    axes.tick_params(which="minor", length=0)
+    axes.grid(which="minor")
+    for at in figure.breaks:
+        axes.axvline(at - 0.5, color=theme.ink, linewidth=1.2, zorder=2.5)
 
 
 def draw_goals(axes: Axes, figure: Tracks, theme: Theme) -> list[Artist]:
@@ -549,10 +525,7 @@ def label_cells(canvas: Canvas, axes: Axes, figure: HeatMap | Tracks, height: fl
     """As many row and column labels as are readable: all, turned, or every n-th."""
     rows, columns = len(figure.row_labels), len(figure.column_labels)
     every = nice_step(rows * 0.17 / height)
-    axes.set_yticks(
-        range(0, rows, every),
-        [shortened(label) for label in figure.row_labels[::every]],
-    )
+    axes.set_yticks(range(0, rows, every), [shortened(x) for x in figure.row_labels[::every]])
     labels = [shortened(label) for label in figure.column_labels]
     cell = 3.4 * 72 / columns  # points; 3.4 inches are about what the axes have
     needed = 5.5 * max(map(len, labels)) + 6
@@ -566,15 +539,12 @@ def label_cells(canvas: Canvas, axes: Axes, figure: HeatMap | Tracks, height: fl
 
 
 def shortened(label: object, most: int = 24) -> str:
+    """A label of at most so many characters."""
     text = str(label)
     return text if len(text) <= most else f"{text[: most - 1].rstrip()}…"
 
 
 def nice_step(least: float) -> int:
     """The first of 1, 2, 5, 10, 20, 50, … that is `least` or more."""
-    size = 1
-    while True:
-        for step in (size, 2 * size, 5 * size):
-            if step >= least:
-                return step
-        size *= 10
+    steps = (step * 10**power for power in itertools.count() for step in (1, 2, 5))
+    return next(step for step in steps if step >= least)

@@ -10,9 +10,6 @@ from typing import Any, NamedTuple
 import matplotlib
 
 STATIC = Path(__file__).parent / "static"
-STYLE: dict[Any, Any] = dict(
-    matplotlib.rc_params_from_file(STATIC / "figure.mplstyle", use_default_template=False)
-)
 
 
 @dataclass(frozen=True)
@@ -28,6 +25,21 @@ class Theme:
     cold: str  # lowest value of a heat map with both signs
     warm: str  # highest value
     curves: tuple[str, ...]
+
+    @property
+    def rc(self) -> dict[Any, Any]:
+        """Settings of matplotlib: those of all figures, in these colours."""
+        file = STATIC / "figure.mplstyle"
+        colors = {
+            "axes.edgecolor": self.muted,
+            "axes.labelcolor": self.ink,
+            "axes.titlecolor": self.ink,
+            "grid.color": self.grid,
+            "legend.labelcolor": self.ink,
+        }
+        colors |= {f"{axis}tick.color": self.muted for axis in "xy"}
+        colors |= {f"{axis}tick.labelcolor": self.ink for axis in "xy"}
+        return dict(matplotlib.rc_params_from_file(file, use_default_template=False)) | colors
 
 
 LIGHT = Theme(
