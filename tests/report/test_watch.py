@@ -356,7 +356,10 @@ def test_a_team_of_pettingzoo_is_drawn(tmp_path):
 @pytest.mark.parametrize(
     ("env", "told"),
     [
-        (task("Wrapped"), r"Wrapped cannot be drawn: for that it must take render_mode.*it names \['rgb_array'\]"),
+        (
+            task("Wrapped"),
+            r"Wrapped cannot be drawn: for that it must take render_mode.*it names \['rgb_array'\]",
+        ),
         (task("Picky"), r"Picky cannot be drawn: for that it must take render_mode"),
         (crew("Shy"), r"Shy cannot be drawn: for that it must take render_mode"),
         (task("Blind"), r"must take render_mode.*it names \['human'\]"),

@@ -21,13 +21,13 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text as Words
-from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, MaxNLocator
 from matplotlib.transforms import offset_copy
 from numpy.typing import NDArray
 
 from .sections import Curve, Figure, HeatMap, Reference, Tracks
 from .styles import DASHES, Look, Theme, assign
-from .tables import CENTRES, centred
+from .tables import mean
 
 Floats = NDArray[np.float64]
 Plot = Figure | HeatMap | Tracks
@@ -90,7 +90,8 @@ def picture(
 
 
 def note(figure: Plot) -> str:
-    """How to read the figure: what its lines, bands and colours stand for."""
+    """How to read the figure, below it: what its lines, bands and colours stand for, which curves
+    lie on each other, and whether points were left out. "" where there is nothing to say."""
     if isinstance(figure, HeatMap):
         missing = not np.isfinite(np.asarray(figure.values, dtype=np.float64)).all()
         return "Grey: no value." if missing else ""
@@ -100,12 +101,8 @@ def note(figure: Plot) -> str:
     parts = ["One run per line." if figure.joined else "One run per point."]
     if seeds[-1] > 1:
         count = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
-        centre = CENTRES[figure.centre][1]
         band, each = ("Band", "Thin lines") if figure.joined else ("Bars", "Dots")
-        parts = [
-            f"{centre.capitalize()} over {count} runs. {band}: its 95 % bootstrap interval. "
-            f"{each}: each run."
-        ]
+        parts = [f"Mean over {count} runs. {band}: its 95 % bootstrap interval. {each}: each run."]
     for group in coinciding(figure):
         *others, last = [figure.curves[i].label for i in group]
         parts.append(f"{', '.join(others)} and {last} coincide.")
@@ -116,30 +113,39 @@ def note(figure: Plot) -> str:
 
 
 def coinciding(figure: Figure) -> list[list[int]]:
-    """Indices of curves that lie on each other: nearly everywhere within half a percent of the
-    figure's height."""
-    drawn = [sampled(c, figure.centre, figure.log_x, drawn_points(figure)) for c in figure.curves]
+    """Indices of curves that lie on each other, each group in the order of the curves.
+
+    Two coincide if nine tenths of their points are within half a percent of the figure's height,
+    and they share half of the x-axis or more. A curve is compared with the first one of a group.
+    """
+    drawn = [sampled(c, drawn_points(figure)) for c in figure.curves]
     centres = np.concatenate([curve.centre for curve in drawn])
     levels = [level.value for level in figure.references]
     present = [*centres[np.isfinite(centres)], *levels] or [0.0]
     near = 0.005 * (max(present) - min(present))
     groups: list[list[int]] = []
     for i, curve in enumerate(drawn):
-        for group in groups:
-            other = drawn[group[0]]
-            inside = (curve.x >= other.x[0]) & (curve.x <= other.x[-1])
-            apart = np.abs(curve.centre - np.interp(curve.x, other.x, other.centre))[inside]
-            apart, count = apart[np.isfinite(apart)], np.isfinite(curve.centre).sum()
-            if 2 * len(apart) >= count > 0 and np.mean(apart <= near) >= 0.9:
-                group.append(i)
-                break
-        else:
+        alike = (group for group in groups if near_each_other(curve, drawn[group[0]], near))
+        group = next(alike, None)
+        if group is None:
             groups.append([i])
+        else:
+            group.append(i)
     return [group for group in groups if len(group) > 1]
 
 
+def near_each_other(curve: Sampled, other: Sampled, near: float) -> bool:
+    """Whether nine tenths of a curve are no further than `near` from another one, which is read
+    between its points. At least half of its points must lie beside the other curve."""
+    inside = (curve.x >= other.x[0]) & (curve.x <= other.x[-1])
+    apart = np.abs(curve.centre - np.interp(curve.x, other.x, other.centre))[inside]
+    apart, count = apart[np.isfinite(apart)], np.isfinite(curve.centre).sum()
+    return bool(2 * len(apart) >= count > 0 and np.mean(apart <= near) >= 0.9)
+
+
 def description(figure: Plot) -> str:
-    """One sentence for those who cannot see the figure."""
+    """One sentence for those who cannot see the figure: what is drawn against what, and the names
+    of curves and levels. It is the label of the `<svg>` element."""
     what = f"{figure.title}: " if figure.title else ""
     if isinstance(figure, HeatMap):
         rows, columns = np.shape(figure.values)
@@ -178,12 +184,13 @@ def tips(figure: Plot, axes: Axes) -> dict[str, Any] | None:
         return None
     range_ = [float(v) for v in axes.get_xlim()]
     curves = [curve_tips(curve, figure) for curve in figure.curves]
-    return {"box": box, "x": range_, "log": figure.log_x, "name": figure.x_label, "curves": curves}
+    return {"box": box, "x": range_, "name": figure.x_label, "curves": curves}
 
 
 def curve_tips(curve: Curve, figure: Figure) -> dict[str, Any]:
-    """The values of one curve in words, at some of its points."""
-    shown = sampled(curve, figure.centre, figure.log_x, drawn_points(figure))
+    """The values of one curve in words, at no more than `MOST_TIPS` of its points: the mean with
+    its interval, `0.53 [0.51, 0.55]`; "" where a seed has no value."""
+    shown = sampled(curve, drawn_points(figure))
     every = -(-len(shown.x) // MOST_TIPS)
     texts = []
     for value, low, high in zip(shown.centre, shown.low, shown.high, strict=True):
@@ -193,7 +200,11 @@ def curve_tips(curve: Curve, figure: Figure) -> dict[str, Any]:
 
 
 def inline(svg: str, label: str, prefix: str) -> str:
-    """matplotlib's SVG file as an element that can stand in a page beside others."""
+    """matplotlib's SVG file as an element that can stand in a page beside others.
+
+    **Arguments:** `svg`: the file's text; `label`: for those who cannot see the picture; `prefix`:
+    of every id, and of what refers to one.
+    """
     svg = svg[svg.index("<svg") :]
     # The style sheet would act on the whole page: its two rules move to the root.
     svg = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>|<style.*?</style>", "", svg, flags=re.S)
@@ -243,7 +254,11 @@ def draw(figure: Plot, theme: Theme, looks: Looks | None = None, legend: bool = 
 def draw_curves(
     canvas: Canvas, axes: Axes, figure: Figure, theme: Theme, looks: Looks | None
 ) -> list[Line2D]:
-    """All curves and levels; the line of each curve."""
+    """All curves and levels on one pair of axes.
+
+    **Returns:** the line of each curve, which stands for it in a legend. What belongs to curve `i`
+    has ids that begin with `curve-i-`, by which the page's script hides it.
+    """
     looks = looks or assign(curve.label for curve in figure.curves)
     together = coinciding(figure)
     lines: list[Line2D] = []
@@ -268,15 +283,9 @@ def draw_curves(
 
 
 def scale(axes: Axes, figure: Figure) -> None:
-    """Ticks that a reader expects, and the range that was asked for."""
+    """Ticks that a reader expects, and the range that was asked for, widened for the levels."""
     places = np.unique(np.concatenate([np.asarray(c.x, np.float64) for c in figure.curves]))
-    if figure.log_x:
-        axes.set_xscale("log")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        first, last = axes.get_xlim()
-        if last < 300 * first:  # powers of ten alone would be two labels or none
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    elif not figure.joined and len(places) <= 9:
+    if not figure.joined and len(places) <= 9:
         axes.set_xticks(places)
         beside = 0.06 * (places[-1] - places[0]) or 0.5  # room for dots that are moved aside
         axes.set_xlim(places[0] - beside, places[-1] + beside)
@@ -286,7 +295,7 @@ def scale(axes: Axes, figure: Figure) -> None:
         levels = [*figure.y_range, *(line.value for line in figure.references)]
         low, high = min(levels), max(levels)
         axes.set_ylim(low - 0.03 * (high - low), high + 0.03 * (high - low))
-    shorten_ticks(axes.xaxis, always=figure.log_x)
+    shorten_ticks(axes.xaxis)
     shorten_ticks(axes.yaxis)
 
 
@@ -299,8 +308,12 @@ def draw_curve(
     width: float,
     place: Mapping[str, Any],
 ) -> list[Any]:
-    """Runs, interval and, last, the centre of one curve, `width` points wide; dots at `place`."""
-    shown = sampled(curve, figure.centre, figure.log_x, drawn_points(figure))
+    """Runs, interval and, last, the mean of one curve.
+
+    **Arguments:** `width`: of the line, in points; `place`: a transform for dots and bars that
+    stand beside those of other curves, {} where runs are lines.
+    """
+    shown = sampled(curve, drawn_points(figure))
     color = theme.curves[look.color]
     artists: list[Any] = []
     if len(shown.runs) > 1:
@@ -318,7 +331,7 @@ def draw_curve(
 def draw_lines(
     axes: Axes, shown: Sampled, figure: Figure, color: str, place: Mapping[str, Any]
 ) -> list[Artist]:
-    """A thin line for each run, and the band of their interval."""
+    """A thin line for each run, fainter where there are many, and the band of their interval."""
     several = sum(np.shape(other.runs)[0] for other in figure.curves) > 20
     thin: dict[str, Any] = {"lw": 0.6, "alpha": 0.2 if several else 0.35, "zorder": 2}
     band: dict[str, Any] = {"alpha": 0.18, "lw": 0, "zorder": 2.5}
@@ -341,13 +354,14 @@ def draw_dots(
 
 
 def drawn_points(figure: Figure) -> int:
-    """Points per line, so that many lines do not make a heavy page."""
+    """Points per line, between 40 and `MOST_POINTS`, so that many lines do not make a heavy
+    page."""
     lines = sum(np.shape(curve.runs)[0] for curve in figure.curves)
     return int(np.clip(MOST_SEED_POINTS // lines, 40, MOST_POINTS))
 
 
 @lru_cache(maxsize=64)
-def sampled(curve: Curve, centre: str, log_x: bool, points: int) -> Sampled:
+def sampled(curve: Curve, points: int) -> Sampled:
     """At most `points` of a curve, evenly spread over the axis, the ends among them.
 
     Points are picked, not averaged: a smoothed curve would be another result.
@@ -355,24 +369,22 @@ def sampled(curve: Curve, centre: str, log_x: bool, points: int) -> Sampled:
     x = np.asarray(curve.x, dtype=np.float64)
     runs = np.asarray(curve.runs, dtype=np.float64)
     if len(x) > points:
-        spread = np.geomspace if log_x else np.linspace
-        targets = spread(x[0], x[-1], points)
-        chosen = np.unique(np.clip(np.searchsorted(x, targets), 0, len(x) - 1))
-        chosen = np.union1d(chosen, [0, len(x) - 1])
+        chosen = np.searchsorted(x, np.linspace(x[0], x[-1], points))
+        chosen = np.union1d(np.clip(chosen, 0, len(x) - 1), [0, len(x) - 1])
         x, runs = x[chosen], runs[:, chosen]
     runs = np.where(np.isfinite(runs), runs, np.nan)
-    return Sampled(x, runs, *centred(runs, centre, RESAMPLES))
+    return Sampled(x, runs, *mean(runs, RESAMPLES))
 
 
-def shorten_ticks(axis: Axis, always: bool = False) -> None:
-    """20k and 1M for 20000 and 1e6."""
-    low, high = np.sort(np.abs(axis.get_view_interval()))
-    if high >= 1e4 or (always and low >= 0.5):  # thousandths would get a unit too
+def shorten_ticks(axis: Axis) -> None:
+    """20k and 1M for 20000 and 1e6, on an axis that reaches 10,000 or more."""
+    if np.max(np.abs(axis.get_view_interval())) >= 1e4:
         axis.set_major_formatter(EngFormatter(sep=""))
 
 
 def add_legend(canvas: Canvas, handles: Sequence[Artist]) -> None:
-    """A legend below the axes, in as many columns as fit; the canvas grows by its height."""
+    """A legend below the axes, in as many columns as fit, four at most; the canvas grows by its
+    height. None without handles."""
     for most in range(min(len(handles), 4), 0, -1):
         rows = math.ceil(len(handles) / most)
         columns = math.ceil(len(handles) / rows)
@@ -387,7 +399,8 @@ def add_legend(canvas: Canvas, handles: Sequence[Artist]) -> None:
 def label_references(
     canvas: Canvas, axes: Axes, references: Sequence[Reference], theme: Theme
 ) -> None:
-    """Names at the right end of the reference lines, moved apart where they would overlap."""
+    """Names at the right end of the reference lines, moved apart where they would overlap; a thin
+    line leads from each to its level. Constrained layout makes room for them."""
     lines = sorted(references, key=lambda line: line.value)
     bottom, top = axes.get_ylim()
     ends = [(line.value - bottom) / (top - bottom) for line in lines]
@@ -421,7 +434,8 @@ def spread_out(centres: Sequence[float], heights: Sequence[float]) -> list[float
 
 
 def draw_heat_map(canvas: Canvas, axes: Axes, figure: HeatMap, theme: Theme) -> None:
-    """One rectangle a cell, a bar that explains their colours, and labels."""
+    """One rectangle a cell, a bar that explains their colours, and labels. The canvas is as high as
+    the rows need: 0.2 inches each, within limits."""
     values = np.asarray(figure.values, dtype=np.float64)
     values = np.where(np.isfinite(values), values, np.nan)
     height = float(np.clip(0.65 + 0.2 * len(values), 1.65, 5.35))  # inches, of the cells
@@ -506,7 +520,11 @@ def draw_goals(axes: Axes, figure: Tracks, theme: Theme) -> list[Artist]:
 
 
 def color_scale(values: Floats, theme: Theme) -> tuple[Colormap, float, float]:
-    """From the page's own colour to a strong one; values of both signs meet at zero."""
+    """Colours of a heat map, and the values of the first and the last one.
+
+    From the page's own colour to a strong one; values of both signs meet at zero, where the page's
+    colour is. NaN is grey. Where all values are one, the scale is one wide.
+    """
     present = values[~np.isnan(values)]
     low, high = (present.min(), present.max()) if present.size else (0.0, 1.0)
     stops = [theme.page, theme.cold]
@@ -522,7 +540,8 @@ def color_scale(values: Floats, theme: Theme) -> tuple[Colormap, float, float]:
 
 
 def label_cells(canvas: Canvas, axes: Axes, figure: HeatMap | Tracks, height: float) -> None:
-    """As many row and column labels as are readable: all, turned, or every n-th."""
+    """As many row and column labels as are readable: all, turned, or every n-th. `height`: of all
+    rows, in inches. The canvas grows where labels are turned."""
     rows, columns = len(figure.row_labels), len(figure.column_labels)
     every = nice_step(rows * 0.17 / height)
     axes.set_yticks(range(0, rows, every), [shortened(x) for x in figure.row_labels[::every]])

@@ -54,9 +54,7 @@ def _gif(path: pathlib.Path, rate: float) -> Iterator[Add]:
     images = []
     yield lambda picture: images.append(Image.fromarray(picture))
     duration = 10 * max(2, round(100 / rate))  # ms; the format counts time in hundredths
-    images[0].save(
-        path, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0
-    )
+    images[0].save(path, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0)
 
 
 @contextlib.contextmanager
@@ -89,7 +87,7 @@ def _ffmpeg(path: pathlib.Path, rate: float, size: str) -> subprocess.Popen[byte
     import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
 
     source = f"-v error -f rawvideo -pix_fmt rgb24 -s {size} -r {rate} -i -".split()
-    target = "-c:v libx264 -crf 18 -pix_fmt yuv420p -y".split()
+    target = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-y"]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), *source, *target, str(path.absolute())]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
 
@@ -133,17 +131,14 @@ def _opened(
     """A task with further arguments, and its one copy, opened in this process."""
     kwargs = tuple((dict(task.kwargs) | arguments).items())
     task = replace(task, kwargs=kwargs, in_process=True, tolerated=0.0, at_once=None)
-    copies: Any = None
     try:
-        copies = task.copies(1)
-        yield task, copies.here
+        copies: Any = task.copies(1)
+        with contextlib.closing(copies):
+            yield task, copies.here
     except EnvironmentFailure as failure:
         chosen = os.environ.get("MUJOCO_GL", "")  # its library is loaded with MuJoCo
         hint = f"; MUJOCO_GL is {chosen!r}" if "OpenGL" in str(failure) else ""
         raise RunError(f"{failure}{hint}") from failure
-    finally:
-        if copies is not None:
-            copies.close()
 
 
 def _first(error: BaseException) -> BaseException:
@@ -177,6 +172,8 @@ def draw(render: Callable[[], Any], name: str, env: Any = None) -> np.ndarray:
 
 
 def _advice(env: Any) -> str:
+    """What to do where drawing fails: MuJoCo wants OpenGL, which a machine without a display has
+    under two other names."""
     mujoco = sys.modules.get("gymnasium.envs.mujoco.mujoco_env")
     if mujoco and isinstance(getattr(env, "unwrapped", None), mujoco.MujocoEnv):
         return (

@@ -38,20 +38,23 @@ def markdown_prose(text: str) -> str:
 
 
 def markdown_text(text: object) -> str:
-    """Text in Markdown, or in a cell of its table: nothing in it is markup."""
+    """Text in Markdown, or in a cell of its table: nothing in it is markup. White space is one
+    blank, HTML and what Markdown and GitHub's formulas take for markup is escaped."""
     line = html.escape(re.sub(r"\s+", " ", str(text)), quote=False)
     line = re.sub(r"([\\`*|$~]|\](?=[(\[:])|(?<!\w)_|_(?!\w))", r"\\\1", line)
     return re.sub(r"^(\d*)([#+.)-])(?=[# ])", r"\1\\\2", line)  # a heading or an item
 
 
 def fenced(text: str) -> str:
-    """A block of code that its text cannot end."""
+    """A block of code that its text cannot end: its fence is longer than any in the text."""
     fence = "`" * max(3, 1 + max(map(len, re.findall("`+", text)), default=0))
     return f"{fence}sh\n{text}\n{fence}"
 
 
 @functools.cache
 def _environment() -> jinja2.Environment:
+    """What templates have besides their arguments: the filters above. In `*.html` everything is
+    escaped that is not marked as safe; JSON (`tojson`) is compact and cannot end a script."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("credo.report"),
         autoescape=jinja2.select_autoescape(["html"]),

@@ -22,7 +22,8 @@ def write(page: Page, path: str | os.PathLike[str]) -> Path:
 
 
 def render(page: Page) -> str:
-    """The page as HTML."""
+    """The page as HTML, with style sheet and script inside: nothing is loaded from anywhere.
+    Neighbouring figures stand together, two beside each other on a wide screen."""
     parts = itertools.groupby(drawn(page), lambda part: part.kind == "figure")
     return markup.render(
         "page.html",

@@ -93,7 +93,8 @@ def _entries(
 
 
 def plain(value: Any) -> Any:
-    """NumPy and JAX numbers, and lists of them, as Python's; what is not finite is None."""
+    """NumPy and JAX numbers, and lists and mappings of them, as Python's, so that JSON can hold
+    them; what is not finite is None. Text stays text."""
     if isinstance(value, Mapping):
         return {str(key): plain(x) for key, x in value.items()}
     if isinstance(value, str) or value is None:
@@ -124,6 +125,7 @@ class Results:
         out; `name=None` asks for rows that do not have it."""
 
         def fits(found: Labels) -> bool:
+            """Whether these labels are the wanted ones."""
             return all(
                 found.get(name) in wanted
                 if isinstance(wanted, tuple | list | set | frozenset)
@@ -188,7 +190,11 @@ class Results:
 
 
 def write(results: Results, path: str | os.PathLike[str]) -> None:
-    """Write `results.json`, one line per row and curve, so that a diff can be read."""
+    """Write `results.json`, one line per row and curve, so that a diff can be read.
+
+    Runs of one curve (the same labels, metric and places) are one line, by seed. The columns of the
+    rows are all labels that any row has, in order of appearance. A reader never sees half a file.
+    """
     names = list(dict.fromkeys(name for row in results.rows for name in row.labels))
     curves: dict[str, dict[str, Any]] = {}
     for curve in results.curves:
@@ -211,6 +217,7 @@ def write(results: Results, path: str | os.PathLike[str]) -> None:
 
 
 def _block(value: str | list[str]) -> str:
+    """JSON of a field, of a list one line per entry."""
     return value if isinstance(value, str) else "[\n" + ",\n".join(value) + "\n]"
 
 
@@ -235,7 +242,8 @@ def read(path: str | os.PathLike[str]) -> Results:
 
 
 def concat(parts: Iterable[Iterable[Row | Series]]) -> tuple[list[Row], list[Series]]:
-    """Rows and series of several measurements, each kind together."""
+    """Rows and series of several measurements, each kind together and in order: what a measure of
+    an experiment yields mixes both."""
     every = [item for part in parts for item in part]
     found = [item for item in every if isinstance(item, Row)]
     return found, [item for item in every if isinstance(item, Series)]

@@ -60,7 +60,8 @@ def write(
 
 
 def describe(runs: Groups, paths: Sequence[pathlib.Path]) -> Page:
-    """The page about runs."""
+    """The page about runs `paths`: scores, what each algorithm improves, attribution, settings, and
+    where they were made. `runs`: those that differ in their seed alone, by label."""
     every = [run.config for group in runs.values() for run in group]
     machines = [config["machine"] for config in every]
     versions = (", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines)
@@ -89,6 +90,7 @@ def describe(runs: Groups, paths: Sequence[pathlib.Path]) -> Page:
 
 
 def _once(texts: Iterable[str]) -> list[str]:
+    """Texts without repetitions, in order of appearance."""
     return list(dict.fromkeys(texts))
 
 
@@ -123,6 +125,7 @@ def _learner_word(learner: Tree) -> str:
 
 
 def _class(tree: Tree) -> str:
+    """The class of a record without its module."""
     return tree["class"].partition(":")[2]
 
 
@@ -140,7 +143,8 @@ def group_labels(trees: Sequence[Tree]) -> list[str]:
 
 
 def telling(flat: Sequence[Mapping[str, Any]]) -> list[str]:
-    """At most three fields by which settings can be told apart, or nearly so."""
+    """At most three fields by which settings can be told apart, or nearly so: again and again the
+    field that tells most of them apart, given those that were chosen before."""
 
     def kinds(fields: Sequence[str]) -> int:
         return len({tuple(str(tree.get(key)) for key in fields) for tree in flat})
@@ -217,8 +221,11 @@ def _figure(runs: Groups, metric: str, title: str) -> Figure:
 
 
 def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
-    """One metric of runs that differ in their seed, as far as all of them are. Over frames they
-    have rows at places of their own: each keeps its value until its next row."""
+    """One metric of runs that differ in their seed, as far as all of them are.
+
+    Over frames, runs have rows at places of their own: each keeps its value until its next row, and
+    the curve has points at up to 240 places that they share, from where all have begun.
+    """
     columns = [run.metrics for run in group]
     if unit == "generation":
         length = min(len(c[unit]) for c in columns)
@@ -256,6 +263,8 @@ def _table(runs: Groups) -> Table:
 
 
 def _row(label: str, group: list[Run]) -> list[Cell]:
+    """An algorithm in the table: the last score of each seed, the bounds of its task (None where
+    they are not known), seeds, and the generations that all runs have."""
     scores = [float(run.metrics["champion_score"][-1]) for run in group]
     told: list[Cell] = [None, None]
     if bounds := _bounds(group):

@@ -7,7 +7,6 @@ records is cheap: it loads neither.
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,8 +14,8 @@ from numpy.typing import ArrayLike
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """Independent runs in one cell of a table: shown as their mean (or interquartile mean) with a
-    95 % bootstrap interval, and every run.
+    """Independent runs in one cell of a table: shown as their mean with a 95 % bootstrap interval,
+    and every run.
 
     `values`: one per seed, in the order of `seeds`; None where a run has none. `scale`: what they
     are multiplied with, 100 for percent. `digits`: behind the point; None: three or four in all.
@@ -26,7 +25,6 @@ class Summary:
     seeds: Sequence[int] = ()
     scale: float = 1.0
     digits: int | None = None
-    centre: Literal["mean", "iqm"] = "mean"
 
     def __post_init__(self):
         if len(self.seeds) not in (0, len(self.values)):
@@ -76,7 +74,7 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """Curves over a common axis, with the interval of their centre and every seed.
+    """Curves over a common axis, with the mean over seeds, its interval and every seed.
 
     `joined`: whether a run goes on from one x to the next. Over depth, coupling or another setting
     each x has runs of its own, which are drawn as dots.
@@ -88,20 +86,14 @@ class Figure:
     curves: Sequence[Curve]
     references: Sequence[Reference] = ()
     caption: str = ""
-    log_x: bool = False
     y_range: tuple[float, float] | None = None  # (low, high); widened to show the references
-    centre: Literal["mean", "median", "iqm"] = "mean"  # the thick line
     joined: bool = True
 
     def __post_init__(self):
         if not self.curves:
             raise ValueError(f"figure {self.title!r} has no curves: give at least one")
-        if self.log_x and any(np.min(curve.x) <= 0 for curve in self.curves):
-            raise ValueError(f"figure {self.title!r} has log_x, but an x that is not positive")
         if self.y_range is not None and not self.y_range[0] < self.y_range[1]:
             raise ValueError(f"figure {self.title!r} has y_range {self.y_range}: give (low, high)")
-        if self.centre not in ("mean", "median", "iqm"):
-            raise ValueError(f"centre is {self.centre!r}: it must be 'mean', 'median' or 'iqm'")
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +170,7 @@ class Tracks:
         """The same in words, a row for each column of the picture."""
 
         def note(track: Track, column: int) -> list[str]:
+            """What is added to a place, if anything."""
             return [x for x in track.notes[column : column + 1] if x]
 
         notes = [self.outcomes[0 if reached else 1] for reached in self.reached]
@@ -226,6 +219,8 @@ class Table:
 
 @dataclass(frozen=True)
 class Text:
+    """Paragraphs; what stands between backticks is code."""
+
     title: str
     paragraphs: Sequence[str]
 

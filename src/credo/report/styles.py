@@ -66,7 +66,8 @@ DASHES = ((1.0, 0.0), (6.0, 1.6), (6.0, 1.5, 1.3, 1.5), (1.3, 1.3))  # in widths
 
 
 class Look(NamedTuple):
-    """Indices of a colour among a theme's `curves`, and of `DASHES`."""
+    """How a curve looks in every theme: indices of a colour among a theme's `curves`, and of
+    `DASHES`."""
 
     color: int
     dash: int

@@ -1,5 +1,5 @@
 """Cells of tables in words, and one convention for independent runs wherever they are shown: their
-mean (or another centre), a 95 % bootstrap interval of it, and every run."""
+mean, its 95 % bootstrap interval, and every run."""
 
 import math
 from numbers import Integral, Real
@@ -8,25 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..analysis.statistics import Statistic, bootstrap_interval, interquartile_mean
+from ..analysis.statistics import bootstrap_interval
 from .sections import Cell, Summary, Table
 
 Floats = NDArray[np.float64]
 
-CENTRES: dict[str, tuple[Statistic, str]] = {
-    "mean": (np.mean, "mean"),
-    "median": (np.median, "median"),
-    "iqm": (interquartile_mean, "interquartile mean"),
-}
 FEW = 5  # runs of which all values are shown
 NOTE = (
-    "In brackets: 95 % bootstrap interval of the {centre} over runs. Small: each run; of more than "
+    "In brackets: 95 % bootstrap interval of the mean over runs. Small: each run; of more than "
     f"{FEW}, the least and the largest."
 )
 
 
-class Centre(NamedTuple):
-    """A centre over runs and its interval, each of the shape of one run."""
+class Mean(NamedTuple):
+    """A mean over runs and its interval, each of the shape of one run."""
 
     value: Floats
     low: Floats
@@ -34,7 +29,7 @@ class Centre(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """A cell in words: `small` stands below `text`, `title` in a tooltip. Of a summary: the centre
+    """A cell in words: `small` stands below `text`, `title` in a tooltip. Of a summary: the mean
     with its interval, `0.53 [0.51, 0.55]`; every run, of many `0.40 … 0.60, n = 10`, of one
     nothing; and every run with its seed."""
 
@@ -43,17 +38,15 @@ class Shown(NamedTuple):
     title: str = ""
 
 
-def centred(runs: ArrayLike, centre: str = "mean", resamples: int = 2000) -> Centre:
-    """`centre` (a name of `CENTRES`) of `runs[runs, …]` with its 95 % percentile bootstrap
-    interval, which is NaN for one run and where a run has no value."""
+def mean(runs: ArrayLike, resamples: int = 2000) -> Mean:
+    """The mean over `runs[runs, …]` with its 95 % percentile bootstrap interval, which is NaN for
+    one run and where a run has no value."""
     runs = np.asarray(runs, np.float64)
-    statistic = CENTRES[centre][0]
-    low, high = bootstrap_interval(runs, statistic, resamples=resamples)
-    return Centre(statistic(runs, axis=0), low, high)
+    return Mean(runs.mean(axis=0), *bootstrap_interval(runs, resamples=resamples))
 
 
 def shown(cell: Cell) -> Shown:
-    """A cell as a table shows it."""
+    """A cell as a table shows it: text as given, numbers as of `number`, None as a dash."""
     if isinstance(cell, Summary):
         return _summary(cell)
     if cell is None:
@@ -71,7 +64,7 @@ def _summary(summary: Summary) -> Shown:
     title = ", ".join(f"seed {seed}: {x}" for seed, x in zip(seeds, each, strict=True))
     if not found:
         return Shown("–", "", title)
-    value, low, high = (number(float(x), places) for x in centred(found, summary.centre))
+    value, low, high = (number(float(x), places) for x in mean(found))
     if len(found) == 1:
         return Shown(value, "", title)
     extremes = f"{number(min(found), places)} … {number(max(found), places)}, n = {len(found)}"
@@ -103,7 +96,7 @@ def number(value: Any, places: int | None = None) -> str:
 
 
 def numeric(table: Table) -> list[bool]:
-    """Which columns hold numbers, and nothing else."""
+    """Which columns hold numbers and summaries, and nothing else but None: they stand right."""
     return [
         any(map(_is_number, column)) and all(cell is None or _is_number(cell) for cell in column)
         for column in zip(*table.rows, strict=True)
@@ -111,11 +104,13 @@ def numeric(table: Table) -> list[bool]:
 
 
 def _is_number(cell: object) -> bool:
+    """Whether a cell is a number or a summary of some; a truth value is text."""
     return isinstance(cell, Real | Summary) and not isinstance(cell, bool | np.bool_)
 
 
 def hidden_runs(table: Table) -> list[tuple[str, str, str]]:
-    """Row, column and every run of the summaries that show their extremes alone."""
+    """Row, column and every run of the summaries that show their extremes alone. A page of HTML has
+    them in tooltips; Markdown has none, and lists them below the table."""
     return [
         (shown(row[0]).text, column, shown(cell).title)
         for row in table.rows
@@ -126,8 +121,6 @@ def hidden_runs(table: Table) -> list[tuple[str, str, str]]:
 
 def note(table: Table) -> str:
     """What brackets and small numbers of a table mean; "" if it has none."""
-    cells = [cell for row in table.rows for cell in row if isinstance(cell, Summary)]
-    if all(len(cell.values) <= 1 for cell in cells):
-        return ""
-    names = dict.fromkeys(CENTRES[cell.centre][1] for cell in cells)
-    return NOTE.format(centre=" or ".join(names))
+    cells = [cell for row in table.rows for cell in row]
+    several = any(isinstance(cell, Summary) and len(cell.values) > 1 for cell in cells)
+    return NOTE if several else ""

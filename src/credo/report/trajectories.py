@@ -58,9 +58,7 @@ def trajectories(
         _pois(axes, poi, observed, activation_distance, theme)
         _paths(axes, position, theme)
         canvas.savefig(svg, format="svg", transparent=True)
-    label = (
-        f"paths of {position.shape[1]} rovers; {np.sum(observed)} of {len(poi)} POIs observed"
-    )
+    label = f"paths of {position.shape[1]} rovers; {np.sum(observed)} of {len(poi)} POIs observed"
     return inline(svg.getvalue(), f"{title}: {label}" if title else label, prefix)
 
 
@@ -125,9 +123,7 @@ def _field(
     axes.grid()
 
 
-def _pois(
-    axes: Axes, poi: np.ndarray, observed: np.ndarray, reach: float, theme: Theme
-) -> None:
+def _pois(axes: Axes, poi: np.ndarray, observed: np.ndarray, reach: float, theme: Theme) -> None:
     """POIs and the rings inside which rovers count: red and solid where `observed[pois]`."""
     for place, seen in zip(poi, observed, strict=True):
         color = SEEN[theme] if seen else theme.ink

@@ -90,7 +90,8 @@ def _memory(trace: Trace) -> dict[str, Any] | None:
 
 
 def _short(value: Any) -> Any:
-    """Plain lists of the shortest numbers that are read back as the same 32 bits."""
+    """What JSON holds: of arrays plain lists of the shortest numbers that are read back as the same
+    32 bits; truth values are 0 and 1. Raises `ValueError` for a number that is not finite."""
     if value is None or isinstance(value, str):
         return value
     if isinstance(value, dict):
@@ -106,5 +107,6 @@ def _short(value: Any) -> Any:
 
 
 def _number(text: str) -> float | int:
+    """A number without a needless ".0"."""
     number = float(text)
     return int(number) if number.is_integer() else number

@@ -62,31 +62,40 @@ def watch(
     if fps is not None and not 0 < fps < math.inf:
         raise ValueError(f"fps is {fps}: it must be more than 0")
     env = run.algorithm.env
-    shown, task = env.viewer(), env.unwrapped
-    played = isinstance(task, AbstractForeignEnvironment)
-    drawn = not isinstance(task, AbstractHostEnvironment) and hasattr(task, "render")
-    kinds = [".html"] * (shown is not None) + [".mp4", ".gif"] * (played or drawn)
-    if not kinds:
-        raise RunError(_nothing_to_see(run))
-    default = run.path / ("champion.html" if shown else "champion.gif")
-    output = default if output is None else pathlib.Path(output)
-    if output.suffix.lower() not in kinds:
-        names = " or ".join(filter(None, [", ".join(kinds[:-1]), kinds[-1]]))
-        raise ValueError(f"the output is to be {str(output)!r}: its name must end in {names}")
-    seeds = range(seed, seed + episodes)
+    shown, played = env.viewer(), isinstance(env.unwrapped, AbstractForeignEnvironment)
+    output, seeds = _target(run, output, shown is not None), range(seed, seed + episodes)
     if shown is not None and output.suffix.lower() == ".html":
         policy = champion(run)
         traces = {f"seed {s}": record(env, policy, key=jax.random.key(s)) for s in seeds}
         title = f"Credo: {run.path.name}"
-        return viewer.write(shown, traces, output, title=title, speed=fps)
-    if played:
+        viewer.write(shown, traces, output, title=title, speed=fps)
+    elif played:
         _film_played(run, output, seeds, fps, size)
     else:
         _film_states(run, output, seeds, fps or (shown.speed if shown else STEPS), size)
     return output
 
 
+def _target(run: Run, output: str | pathlib.Path | None, page: bool) -> pathlib.Path:
+    """The file to write; `page`: whether the task has one that plays. Raises `RunError` if nothing
+    of the task can be drawn, `ValueError` for a kind of file that cannot be made of it."""
+    task = run.algorithm.env.unwrapped
+    drawn = not isinstance(task, AbstractHostEnvironment) and hasattr(task, "render")
+    filmed = drawn or isinstance(task, AbstractForeignEnvironment)
+    kinds = [".html"] * page + [".mp4", ".gif"] * filmed
+    if not kinds:
+        raise RunError(_nothing_to_see(run))
+    if output is None:
+        return run.path / ("champion.html" if page else "champion.gif")
+    output = pathlib.Path(output)
+    if output.suffix.lower() not in kinds:
+        names = " or ".join(filter(None, [", ".join(kinds[:-1]), kinds[-1]]))
+        raise ValueError(f"the output is to be {str(output)!r}: its name must end in {names}")
+    return output
+
+
 def _nothing_to_see(run: Run) -> str:
+    """What is said of a task that cannot be drawn: which can, and what else shows the run."""
     return (
         f"{type(run.algorithm.env.unwrapped).__name__} has nothing to draw: what can be watched "
         "are rovers, T-mazes (up to 6 deep), server fleets, sequences, tasks of Gymnasium and "
