@@ -166,8 +166,12 @@ def description(figure: Plot) -> str:
 
 
 def tips(figure: Plot, axes: Axes) -> dict[str, Any] | None:
-    """What a tooltip tells, as JSON can hold it, and where in the picture: `box` is the axes' left,
-    top, width and height as shares of the picture's. None of tracks, beside which is a table."""
+    """What a tooltip tells, as JSON can hold it, for `static/page.js`.
+
+    `box` is the axes' left, top, width and height as shares of the picture's. Of curves, `x` is the
+    range of the axis and `curves` has their values in words; of a heat map, `rows` and `columns`
+    are names and `values[rows, columns]` words. None of tracks, beside which is a table.
+    """
     place = axes.get_position()
     box = [round(v, 4) for v in (place.x0, 1 - place.y1, place.width, place.height)]
     if isinstance(figure, HeatMap):
@@ -457,7 +461,13 @@ def draw_heat_map(canvas: Canvas, axes: Axes, figure: HeatMap, theme: Theme) -> 
 
 
 def draw_tracks(canvas: Canvas, axes: Axes, figure: Tracks, theme: Theme) -> list[Artist]:
-    """Everybody, the goals and the breaks; what stands for them in the legend."""
+    """Everybody, the goals and the breaks.
+
+    Marks in one cell stand beside and below each other, in as many columns as make them largest;
+    a faint line joins those of one track. Scripted ones are crosses of the text's colour.
+
+    **Returns:** what stands for goals and tracks in the legend.
+    """
     rows, columns = len(figure.row_labels), len(figure.column_labels)
     cell = 3.9 / columns  # inches; about what the axes have
     height = float(np.clip(rows * max(cell, 0.24), 1.3, 4.0))

@@ -128,7 +128,8 @@ def drawing(
 def _opened(
     task: AbstractForeignEnvironment, **arguments: Any
 ) -> Iterator[tuple[AbstractForeignEnvironment, Any]]:
-    """A task with further arguments, and its one copy, opened in this process."""
+    """A task with further arguments, and its one copy, opened in this process and closed behind the
+    block. Raises `RunError` if it cannot be opened, or fails inside the block."""
     kwargs = tuple((dict(task.kwargs) | arguments).items())
     task = replace(task, kwargs=kwargs, in_process=True, tolerated=0.0, at_once=None)
     try:
@@ -142,7 +143,7 @@ def _opened(
 
 
 def _first(error: BaseException) -> BaseException:
-    """What led to an error in the end."""
+    """What an error goes back to, by its chain of causes."""
     while error.__cause__ is not None:
         error = error.__cause__
     return error

@@ -6,8 +6,12 @@ from .sections import HeatMap, Track, Tracks
 
 
 def pictures(title: str, episode: dict[str, Any]) -> list[Tracks | HeatMap]:
-    """Where everybody went in an episode of `MazeTrace.plain`, and the memory of each robot, if it
-    has one. `title`: begins the title of each."""
+    """Figures of an episode, trial by trial.
+
+    **Arguments:** `title`: begins the title of each; `episode`: as `MazeTrace.plain` gives it.
+
+    **Returns:** where everybody went, and of each robot with memory that `[cells, trials]`.
+    """
     robots = len(episode["endpoint"])
     names = [f"robot {i + 1}" for i in range(robots)] if robots > 1 else ["robot"]
     walk = _walk(title, names, episode)
@@ -54,7 +58,7 @@ def _walk(title: str, names: list[str], episode: dict[str, Any]) -> Tracks:
 
 
 def turns(endpoint: int, depth: int) -> str:
-    """The way to an endpoint: L or R at each junction."""
+    """The way to an endpoint, L or R at each junction: endpoint 1 at depth 2 is LR."""
     return "".join("LR"[endpoint >> i & 1] for i in reversed(range(depth)))
 
 

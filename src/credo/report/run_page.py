@@ -178,7 +178,7 @@ def _short(key: str, others: Sequence[str]) -> str:
 
 
 def _text(value: Any) -> str:
-    """A setting in words."""
+    """A setting in words, at most 24 characters."""
     return "none" if value is None else shortened(value)
 
 
@@ -196,7 +196,8 @@ def _indexed(tree: Any) -> Any:
 
 
 def _improved(runs: Groups) -> list[Figure]:
-    """What each algorithm improves: fitness, or a loss."""
+    """What each algorithm improves: fitness, or a loss, where all of its runs have recorded it. One
+    figure for each of the two that any algorithm has."""
     titles = {"fitness_max": "Best fitness of each generation", "loss": "Loss of each generation"}
     improves = {
         label: next((x for x in titles if all(x in run.metrics for run in group)), None)

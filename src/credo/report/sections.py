@@ -120,7 +120,8 @@ class HeatMap:
 
 @dataclass(frozen=True)
 class Track:
-    """Somebody's row at each column of `Tracks`. `notes`: what the table adds at each column."""
+    """Somebody's row at each column of `Tracks`. `notes`: what the table adds at each column, ""
+    where there is nothing to add; none at all if there is nothing anywhere."""
 
     label: str
     rows: Sequence[int]
@@ -184,7 +185,8 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A picture of its own: one `<svg>` element for each colouring, whose ids differ."""
+    """A picture of its own: one `<svg>` element for each colouring. Ids must differ, also from
+    those of other drawings on the page (see the `prefix` of `trajectories`)."""
 
     title: str
     light: str
@@ -231,9 +233,13 @@ Section = Drawn | Table | Text
 
 @dataclass(frozen=True)
 class Page:
-    """`command` is what makes the page, exactly as typed; `facts` say where its numbers come
-    from: versions, processor, seeds; each is one value or several. `banner`: what a reader must
-    know before anything else, such as `SMOKE`."""
+    """A page of results.
+
+    `lead`: a sentence or two below the title. `command`: what makes the page, exactly as typed.
+    `sections`: in order; neighbouring figures stand together. `facts`: where its numbers come from
+    (versions, processor, seeds); each is one value or several. `banner`: what a reader must know
+    before anything else, such as `SMOKE`. Lead and captions are prose: `code` between backticks.
+    """
 
     title: str
     lead: str

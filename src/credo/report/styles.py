@@ -86,14 +86,19 @@ ALIASES = {"gradient": "bptt", "evolution": "neuroevolution", "ff": "mlp", "feed
 
 
 def method(label: str) -> str | None:
-    """The first known method that a label names, in any spelling of case."""
+    """The first known method that a label names, in any spelling of case: "erl" of "ERL: 10
+    policies". None if there is none."""
     words = (ALIASES.get(word, word) for word in re.findall(r"\w+", label.lower()))
     return next((word for word in words if word in METHODS), None)
 
 
 def assign(labels: Iterable[str]) -> Mapping[str, Look]:
-    """How the curves of a page look: a label that names a method as that method; any other, and a
-    second of the same method, as nothing else on the page. The same labels look the same."""
+    """How the curves of a page look, by label.
+
+    A label that names a method looks as that method does on every page; any other, and a second of
+    the same method, as nothing else on this page, in the colour that is used least. The same labels
+    look the same. There are 28 looks; of more curves than that, some look alike.
+    """
     names = list(dict.fromkeys(labels))
     looks: dict[str, Look] = {}
     for name in sorted(names, key=lambda name: name.lower() not in METHODS):  # exact ones first

@@ -108,7 +108,8 @@ def pictures(
 def _field(
     axes: Axes, position: np.ndarray, poi: np.ndarray, reach: float, size: float, theme: Theme
 ) -> None:
-    """A square view of the field, `size` metres wide, and of what lies outside it."""
+    """A square view of the field, `size` metres wide, and of what lies outside it: all positions
+    and rings fit in. Ticks are in metres; the page shows through."""
     around = [np.zeros((1, 2)), np.full((1, 2), size), position.reshape(-1, 2)]
     points = np.concatenate([*around, poi - reach, poi + reach])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -136,7 +137,8 @@ def _pois(axes: Axes, poi: np.ndarray, observed: np.ndarray, reach: float, theme
 
 
 def _counts(axes: Axes, env: Rover, shown: Mapping[str, np.ndarray], t: int) -> None:
-    """Below each POI, how many rovers are inside its ring, of those that it takes."""
+    """Below each POI, how many rovers are inside its ring at step `t`, of those that it takes; or
+    that it was observed."""
     offset = {"textcoords": "offset points", "xytext": (0, -16), "ha": "center", "fontsize": 8}
     now = (shown["poi"], shown["observed"][t], shown["inside"][t])
     for place, seen, inside in zip(*now, strict=True):

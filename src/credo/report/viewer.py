@@ -67,7 +67,8 @@ def page(
 
 
 def _episode(viewer: Viewer, trace: Trace) -> dict[str, Any]:
-    """What a page holds of an episode: of the task, and of every task."""
+    """What a page holds of an episode: what every task has (its length, how it ended, rewards by
+    name and step, the policy's memory), and what this task's drawing needs."""
     shown = viewer.rewards or tuple(trace.rewards)
     return {
         "steps": int(trace.length),

@@ -108,7 +108,8 @@ def _nothing_to_see(run: Run) -> str:
 def _film_states(
     run: Run, output: pathlib.Path, seeds: range, rate: float, size: tuple[int, int]
 ) -> None:
-    """A video of a task in JAX, from traces."""
+    """A video of a task in JAX, from traces: every `stride`-th step, and the last one, at no more
+    than `FASTEST` pictures per second. `rate`: steps per second."""
     env, policy, stride = run.algorithm.env, champion(run), math.ceil(rate / FASTEST)
     with films.film(output, rate / stride) as add:
         for seed in seeds:
@@ -137,7 +138,8 @@ def _pictures(
 def _film_played(
     run: Run, output: pathlib.Path, seeds: range, fps: float | None, size: tuple[int, int]
 ) -> None:
-    """A video of a task that draws itself, made while it is played."""
+    """A video of a task that draws itself, made while it is played. `fps`: steps per second; None:
+    those that the environment names, else `STEPS`."""
     task, policy = run.algorithm.env.unwrapped, champion(run)
     with films.drawing(task, size) as (opened, env):
         rate = fps or getattr(env, "metadata", {}).get("render_fps") or STEPS
