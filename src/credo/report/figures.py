@@ -567,10 +567,10 @@ def label_cells(canvas: Canvas, axes: Axes, figure: HeatMap | Tracks, height: fl
             label.set(rotation=90, rotation_mode="anchor", ha="right", va="center")
 
 
-def shortened(label: object, most: int = 24) -> str:
-    """A label of at most so many characters."""
+def shortened(label: object) -> str:
+    """A label of at most 24 characters."""
     text = str(label)
-    return text if len(text) <= most else f"{text[: most - 1].rstrip()}…"
+    return text if len(text) <= 24 else f"{text[:23].rstrip()}…"
 
 
 def nice_step(least: float) -> int:
