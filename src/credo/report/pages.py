@@ -13,7 +13,7 @@ from .sections import Drawing, Drawn, Figure, Page, Section, Table, Tracks
 from .styles import DARK, DASHES, LIGHT, Look, assign
 
 TALL = 30  # rows; of more, a table is in a box that scrolls
-WIDE = 8  # columns; of more, a table has smaller print and gaps
+WIDE = 7  # columns; of more, a table has smaller print and gaps
 
 
 def write(page: Page, path: str | os.PathLike[str]) -> Path:
