@@ -251,7 +251,6 @@ class Curves:
     levels: Mapping[str, Of] = field(default_factory=dict)
     where: Mapping[str, Any] = field(default_factory=dict)
     scale: float = 1.0
-    log_x: bool = False
     y_range: tuple[float, float] | None = None
     caption: str = ""
 
@@ -275,7 +274,6 @@ class Curves:
                 curves,
                 [page.Reference(name, x) for name, x in levels if isinstance(x, int | float)],
                 self.caption,
-                self.log_x,
                 self.y_range,
                 joined=bool(here.curves),
             )
