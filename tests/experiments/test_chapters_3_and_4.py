@@ -207,20 +207,6 @@ def test_cells_of_chapter_4_have_the_published_sizes(name):
                 assert len(algorithm.breeder.mating) == (1 if labels["network"] == "cnf" else 2)
 
 
-def test_cells_of_one_name_are_the_same_in_every_experiment():
-    """They share their runs."""
-    for budget in tmazes.BUDGETS:
-        seen, shared = {}, 0
-        for name in CHAPTER_3 + CHAPTER_4:
-            for cell in find(name).cells(budget) if budget in find(name).budgets else []:
-                shared += cell.name in seen
-                kept = seen.setdefault(cell.name, cell)
-                assert kept.algorithm == cell.algorithm
-                assert (kept.seeds, kept.budget) == (cell.seeds, cell.budget)
-                assert pathlib.Path(cell.folder).name == cell.folder
-        assert shared >= (20 if budget == "full" else 5)
-
-
 def test_both_trainers_have_as_many_instances_in_beyond_3():
     for cell in find("beyond-3").cells("full"):
         algorithm = cell.algorithm

@@ -41,7 +41,7 @@ import re
 import shlex
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from importlib import resources
@@ -62,6 +62,7 @@ from ..runs.record import RunError
 from ..runs.store import Run
 from . import catalogue
 
+Axis = tuple[str, ArrayLike]  # "frames", and where on it
 BUDGETS = ("smoke", "quick", "full")  # seconds, minutes, hours
 
 
@@ -151,16 +152,11 @@ class Trained:
         return rows(metric, rounded(values, digits), self.labels, seed=self.seeds, **axes)
 
     def series(
-        self,
-        metric: str,
-        at: tuple[str, ArrayLike],
-        values: Any,
-        digits: int | None = None,
-        **axes: Any,
+        self, metric: str, at: Axis, values: Any, digits: int | None = None, **axes: Any
     ) -> list[Series]:
         """Values `[runs, …, points]` as series over `at`, the name and places of their axis."""
-        axes = {"seed": self.seeds} | axes
-        return series(metric, *at, rounded(values, digits), self.labels, **axes)
+        found = rounded(values, digits)
+        return series(metric, *at, found, self.labels, seed=self.seeds, **axes)
 
     def fact(self, metric: str, value: Any, **labels: Label) -> Row:
         """A row of the cell as a whole: a baseline, a bound."""
@@ -193,7 +189,7 @@ class Value:
     spread: str = ""
 
 
-View = Section | Callable[[Results, Sequence[Value]], Iterable[Section]]
+View = Callable[[Results, Sequence[Value]], Iterable[Section]]
 
 
 @dataclass(frozen=True)
@@ -209,7 +205,7 @@ class Experiment:
     cells: Callable[[str], list[Cell]]
     measures: Sequence[Measure]
     views: Sequence[View]
-    budgets: Iterable[str] = BUDGETS
+    budgets: Collection[str] = BUDGETS
     published: str = ""
     values: Sequence[Value] = ()
     notes: Sequence[tuple[str, Labels]] = ()
@@ -303,17 +299,17 @@ def trained(
     cells: list[Cell], budget: str, work: pathlib.Path, jobs: int | None, title: str
 ) -> list[Trained]:
     """The cells with their runs, in folders of `work`; what is missing of them is trained."""
-    paths = [[work / cell.folder / str(seed) for seed in cell.seeds] for cell in cells]
+
+    def path(cell: Cell, seed: int) -> pathlib.Path:
+        return work / cell.folder / str(seed)
+
     wanted = [
-        local.Job(path, cell.algorithm, seed, RunOptions(**cell.budget, tensorboard=False))
-        for cell, folders in zip(cells, paths, strict=True)
-        for seed, path in zip(cell.seeds, folders, strict=True)
+        local.Job(path(c, seed), c.algorithm, seed, RunOptions(**c.budget, tensorboard=False))
+        for c in cells
+        for seed in c.seeds
     ]
     local.run(wanted, jobs, title=title)
-    return [
-        Trained(cell, [Run(path) for path in folders], budget)
-        for cell, folders in zip(cells, paths, strict=True)
-    ]
+    return [Trained(c, [Run(path(c, seed)) for seed in c.seeds], budget) for c in cells]
 
 
 def matching(cells: list[Cell], only: str, where: str) -> list[Cell]:
@@ -423,6 +419,8 @@ def describe(results: Results) -> Page:
     """The page of results."""
     experiment = find(results.experiment)
     machines = [cell["machine"] for cell in results.cells]
+    hosts = dict.fromkeys(map("{processor}, {device}, {system}".format_map, machines))
+    used = dict.fromkeys(", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines)
     return Page(
         title=f"{results.experiment}: {catalogue.EXPERIMENTS[results.experiment]}",
         lead=experiment.published,
@@ -431,14 +429,8 @@ def describe(results: Results) -> Page:
         facts={
             "budget": results.budget,
             "runs": [f"{named(c['labels'])}: {extent(c)}" for c in results.cells],
-            "machine": list(
-                dict.fromkeys(map("{processor}, {device}, {system}".format_map, machines))
-            ),
-            "versions": list(
-                dict.fromkeys(
-                    ", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines
-                )
-            ),
+            "machine": list(hosts),
+            "versions": list(used),
         },
         banner=SMOKE if results.budget == "smoke" else "",
     )
@@ -446,9 +438,7 @@ def describe(results: Results) -> Page:
 
 def sections(experiment: Experiment, results: Results) -> list[Section]:
     """What the views of an experiment make of results, in order, and how to read it."""
-    found: list[Section] = []
-    for view in experiment.views:
-        found += view(results, experiment.values) if callable(view) else [view]
+    found = [x for view in experiment.views for x in view(results, experiment.values)]
     told = [text for text, x in experiment.notes if not x or results.where(**x).cells]
     return [*found, Text("How to read it", told)] if told else found
 

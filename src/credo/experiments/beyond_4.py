@@ -9,14 +9,13 @@ import jax
 import numpy as np
 
 from ..analysis import fleet, statistics
-from ..environments.extended_tmaze import ExtendedTMaze
 from ..environments.server_fleet import ServerFleet
 from ..environments.wrappers import NoisyObservations
 from ..report import sections as page
-from ..report.rows import Results, Row, Series
+from ..report.rows import Results, Row
 from . import fleets, tmazes
 from .base import Cell, Experiment, Trained, Value
-from .measures import returns
+from .measures import returns, where
 from .views import SEED, Of, Table
 
 NOISE = 0.5  # in training; a request that was served is told as 1 or -1
@@ -57,27 +56,19 @@ def _noisy(env: ServerFleet, std: float) -> NoisyObservations:
     return NoisyObservations(env, std, spared=1)  # the status
 
 
-def measure(trained: Trained) -> Iterator[Row | Series]:
-    """As Figures 4.2 and 4.7; of fleets also the final champions in every noise, and without noise
-    what becomes of them when servers leave and join."""
-    maze = isinstance(trained.env, ExtendedTMaze)
-    for shared in tmazes.MEASURES if maze else fleets.MEASURES:
-        yield from shared(trained)
-    if maze:
-        return
+def in_noise(trained: Trained) -> Iterator[Row]:
+    """Net requests of the final champions of a fleet in every noise."""
     env = fleets.clear(trained.env)
     for std in TESTED:
         net = played(_noisy(env, std), trained.champions)
         yield from pairs(trained.part(**{STD: std}), "net requests in noise", net)
-    if "noise" not in trained.labels:
-        yield from changed(trained, env)
 
 
-def changed(trained: Trained, env: ServerFleet) -> Iterator[Row]:
+def changed(trained: Trained) -> Iterator[Row]:
     """Net requests by what happens to the fleet, beside baselines and bounds of the same task; and
     the difference that it makes, world by world: classes of devices are the same."""
     before = None
-    for name, (task, teams) in fleet.changes(env, trained.champions).items():
+    for name, (task, teams) in fleet.changes(fleets.clear(trained.env), trained.champions).items():
         net, here = played(task, teams), trained.part(fleet=name)
         before = net if before is None else before
         yield from pairs(here, "net requests of a fleet", net)
@@ -142,13 +133,13 @@ def costs(results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
         yield page.Table(title, columns, body, caption="World by world; of scripts, of two means.")
 
 
-def of_question(title: str, where: dict[str, Any]) -> list[Any]:
+def of_question(title: str, labels: dict[str, Any]) -> list[Any]:
     """Table, curves and pictures of the T-mazes of a question."""
     heading = f"{title}: trials in which the final champion team observes the reward, %"
     return [
-        replace(tmazes.SCORES, title=heading, where=where),
-        replace(tmazes.CURVES, where=where),
-        lambda results, values: tmazes.pictures(results.where(**where), values),
+        replace(tmazes.SCORES, title=heading, where=labels),
+        replace(tmazes.CURVES, where=labels),
+        lambda results, values: tmazes.pictures(results.where(**labels), values),
     ]
 
 
@@ -182,4 +173,9 @@ VIEWS = (
     SIZES,
     costs,
 )
-EXPERIMENTS = {"beyond-4": Experiment(cells, (measure,), VIEWS, tmazes.BUDGETS)}
+MEASURES = (
+    *(where(measure, timing=None) for measure in tmazes.MEASURES),
+    *(where(measure, **FLEETS) for measure in (*fleets.MEASURES, in_noise)),
+    where(changed, **FLEETS, noise=None),
+)
+EXPERIMENTS = {"beyond-4": Experiment(cells, MEASURES, VIEWS, tmazes.BUDGETS)}

@@ -12,6 +12,7 @@ from ..report.rows import Results, Row, Series
 from ..report.sections import Section
 from .base import Cell, Experiment, Trained, Value
 from .generalization import DEEPER, DISTRACTORS, OF_DISTRACTORS, TRAINED, by_depth, by_gap, figure
+from .measures import where
 from .memories import MEDIAN, WORST, streams, to_the_end
 from .sequences import (
     BOTH,
@@ -75,12 +76,6 @@ def over_instances(trained: Trained) -> list[Series]:
     return trained.series("success by instances", ("reinforcement instances", used), blocks, 4)
 
 
-def elsewhere(trained: Trained) -> Iterable[Row | Series]:
-    """Networks by gradient, where they were not trained."""
-    if trained.labels["trainer"] == "gradient":
-        yield from (*by_gap(trained), *by_depth(trained))
-
-
 def weights(trained: Trained) -> list[Row]:
     """How many numbers a champion has."""
     count = sum(x.size for x in jax.tree.leaves(trained.runs[0].champion))
@@ -89,13 +84,11 @@ def weights(trained: Trained) -> list[Row]:
 
 def deep(trained: Trained) -> list[Row]:
     """How many signals of long streams champions answer right before a mistake."""
-    if trained.labels["task"] == "recall":
-        return []
     fed = SIGNALS[trained.budget]
     return [trained.fact("signals fed", fed), *streams(trained, fed)]
 
 
-def by_instances(title: str, line: Sequence[str], panel: Sequence[str], **where: str) -> Curves:
+def by_instances(title: str, line: Sequence[str], panel: Sequence[str], **shown: str) -> Curves:
     """Learning curves over reinforcement instances."""
     return curves(
         y="success by instances",
@@ -103,7 +96,7 @@ def by_instances(title: str, line: Sequence[str], panel: Sequence[str], **where:
         line=line,
         panel=panel,
         title=title,
-        where=where,
+        where=shown,
         y_label="success, 50 fresh sequences",
         caption="Means of equal stretches of generations, 1,000 instances each; not smoothed else.",
     )
@@ -139,15 +132,17 @@ STREAMS = Table(
     where={"task": "classification"},
     caption="Signals answered right in a row, distractors between them.",
 )
+# Networks by gradient, where they were not trained.
+ELSEWHERE = [where(measure, trainer="gradient") for measure in (by_gap, by_depth)]
 EXPERIMENTS = {
     "fig-3.11": Experiment(
         on_classification,
-        (*MEASURES, over_instances, elsewhere),
+        (*MEASURES, over_instances, *ELSEWHERE),
         (
             SUMMARY,
             by_instances("(a) {panel}", ("depth",), LINE, trainer="gradient"),
             at_deepest,
-            OF_DISTRACTORS[0],
+            replace(OF_DISTRACTORS[0], levels={}),
             figure(
                 DEEPER, BY_DEPTH, "1,000", levels={"published, 21-deep at 101": constant(0.145)}
             ),
@@ -162,7 +157,7 @@ EXPERIMENTS = {
     ),
     "beyond-3": Experiment(
         on_the_deepest,
-        (*MEASURES, over_instances, weights, deep),
+        (*MEASURES, over_instances, weights, where(deep, task="classification")),
         (
             by_instances("{panel}", LINE, ("task", "depth", "trainer")),
             replace(TABLE, rows=("task", *TABLE.rows)),

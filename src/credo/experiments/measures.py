@@ -7,7 +7,7 @@ run, as it was tested.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -36,6 +36,16 @@ SMOOTHED = 10  # generations; the author's undisclosed moving average
 def undelayed(env: Any) -> Any:
     """The task whose returns are those of `env`: a delay changes only when rewards are paid."""
     return env.env if isinstance(env, DelayedHostReward) else env
+
+
+def where(measure: Measure, **labels: Any) -> Measure:
+    """A measurement of cells with these labels alone; `name=None`: that have none of the name."""
+
+    def of_some(cell: Trained) -> Iterable[Row | Series]:
+        chosen = all(cell.labels.get(name) == value for name, value in labels.items())
+        return measure(cell) if chosen else ()
+
+    return of_some
 
 
 # --------------------------------------------------------------------------- the final champions
