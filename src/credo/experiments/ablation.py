@@ -5,15 +5,15 @@ from dataclasses import replace
 from typing import Any
 
 import jax
+import numpy as np
 
 from ..analysis.generalization import first_mistakes
 from ..environments.curriculum import Curriculum
 from ..evolution.breeder import altered
-from ..report.rows import Row, rows
+from ..report.rows import Row
 from .base import Cell, Experiment, Trained
-from .dissertation import told
-from .fig_3_4a import TEST, deepest, learned, learning, rounded
-from .table_3_2 import streams, to_the_end
+from .memories import streams, to_the_end
+from .sequences import TEST, curves, deepest, learning
 from .views import Table, constant, mean, median
 
 STREAM = {"smoke": 1_000, "quick": 10_000, "full": 100_000}
@@ -45,20 +45,22 @@ def cells(budget: str) -> list[Cell]:
 def measure(trained: Trained) -> list[Row]:
     """Success at the depth of training and at 101, and the shortest of four long streams."""
     far = first_mistakes(trained.champions, 101, TEST, key=jax.random.key(40_000))
-    fed, axes = STREAM[trained.budget], {"labels": trained.labels, "seed": trained.seeds}
-    found = [Row(trained.labels, None, "signals fed", fed)]
-    for metric, depth in (("success", trained.env.depth), ("success at depth 101", 101)):
-        found += rows(metric, rounded((far >= depth).mean(axis=1)), **axes)
-    right: dict[int | None, list[int]] = {}
-    for row in streams(trained, fed, 4):
-        right.setdefault(row.seed, []).append(row.value)
-    return found + rows("signals right", [min(x) for x in right.values()], **axes)
+    fed = STREAM[trained.budget]
+    right = [row.value for row in streams(trained, fed, 4)]
+    shortest = np.reshape(right, (len(trained.seeds), 4)).min(axis=1)
+    depth = trained.env.depth
+    return [
+        trained.fact("signals fed", fed),
+        *trained.rows("success", (far >= depth).mean(axis=1), 4),
+        *trained.rows("success at depth 101", (far >= 101).mean(axis=1), 4),
+        *trained.rows("signals right", shortest),
+    ]
 
 
 TABLE = Table(
     "Final champions: success, %",
-    rows=("preset", "change", "depth"),
-    columns={
+    ("preset", "change", "depth"),
+    {
         "at this depth": mean("success", 100, 1),
         "median (range)": median("success", 100),
         "depth 101": mean("success at depth 101", 100, 1),
@@ -68,7 +70,7 @@ TABLE = Table(
     "Erasing and the limit make the weights that parsimony rewards: without them it does little; "
     "beside the author's fitness, in the hundreds, its 0.3 does nothing.",
 )
-CURVES = learned(
+CURVES = curves(
     y="test success, smoothed",
     x="generation",
     line=("preset", "change"),
@@ -76,6 +78,4 @@ CURVES = learned(
     y_label="success, 50 fresh sequences",
     levels={"published": constant(0.876)},
 )
-EXPERIMENT = Experiment(
-    **told("ablation-3.4a"), cells=cells, measures=(measure, learning), views=(TABLE, CURVES)
-)
+EXPERIMENTS = {"ablation-3.4a": Experiment(cells, (measure, learning), (TABLE, CURVES))}

@@ -1,7 +1,7 @@
-"""Figure 3.4a: success of an evolved MMU on sequence classification, by depth. Also what all of
-chapter 3 shares: cells, success, learning curves, the table."""
+"""Figures 3.4 and 3.9: success of evolved networks on sequence classification and recall, by depth.
+Also what all of chapter 3 shares: cells, success, learning curves, the table."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -16,15 +16,14 @@ from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
 from ..networks.mmu import MMU
 from ..networks.recurrent import Recurrent
-from ..report.rows import Row, Series, rows, series
+from ..report.rows import Row, Series
 from ..rollout import evaluate
 from .base import Cell, Experiment, Trained
-from .dissertation import notes, told
 from .views import Curves, Table, constant, known, mean, median, published
 
 TEST = 1000  # fresh sequences for a final champion; the dissertation used 50
-DEPTHS = {"smoke": (3,), "quick": (2, 5, 10, 21), "full": (2, 3, 4, 5, 6, 10, 15, 21)}
 PRESETS = ("as written", "as coded", "ours")
+NETWORKS = ("mmu", "lstm", "gru", "rnn")
 TASKS = {"classification": SequenceClassification, "recall": SequenceRecall}
 HIDDEN = {"classification": 5, "recall": 20}  # units, as in the author's code
 TRAINERS = {
@@ -40,6 +39,13 @@ GENERATIONS = {  # by gradient: thousands of instances; recall still improves af
 RUNS = {"smoke": 2, "quick": 3, "full": 10}
 FEWER = {"smoke": 2, "quick": 2, "full": 5}  # of what fails alike, and of networks beside the MMU
 LINE = ("preset", "trainer", "network", "memory", "at equal instances", "ties free")
+
+# Depths of the task, by budget.
+CLASSIFICATION = {"smoke": (3,), "quick": (2, 5, 10, 21), "full": (2, 3, 4, 5, 6, 10, 15, 21)}
+DEEPEST = {"smoke": (3,), "quick": (21,), "full": (21,)}
+COMPARED = {"smoke": (3,), "quick": (2, 4, 6), "full": (2, 3, 4, 5, 6)}
+EVEN = {"smoke": (2,), "quick": (2, 4, 6), "full": (2, 4, 6)}
+RECALL = {"smoke": (2,), "quick": (1, 2, 3, 4, 6), "full": (1, 2, 3, 4, 5, 6)}
 
 
 def cell(
@@ -73,68 +79,71 @@ def cell(
     return Cell(labels, algorithm, seeds, generations)
 
 
-def evolved(
-    budget: str, presets: Iterable[str] = PRESETS, depths: Iterable[int] | None = None
-) -> list[Cell]:
-    """MMUs on sequence classification, by evolution."""
-    every = [(depth, preset) for preset in presets for depth in depths or DEPTHS[budget]]
-    return [cell(budget, "classification", *x) for x in every]
+def every(
+    task: str,
+    depths: Mapping[str, Sequence[int]],
+    presets: Sequence[str] = ("ours",),
+    networks: Sequence[str] = ("mmu",),
+    **settings: Any,
+) -> Callable[[str], list[Cell]]:
+    """The cells of every combination, by budget. `depths`: by budget. `settings`: of `cell`."""
+    return lambda budget: [
+        cell(budget, task, depth, preset, network=network, **settings)
+        for preset in presets
+        for network in networks
+        for depth in depths[budget]
+    ]
 
 
-def deepest(budget: str, presets: Iterable[str] = ("ours",)) -> list[Cell]:
-    """The 21-deep runs, into which the case study looks (3-deep at smoke)."""
-    return evolved(budget, presets, DEPTHS[budget][-1:])
+# The 21-deep runs, into which the case study looks (3-deep at smoke).
+deepest = every("classification", DEEPEST)
+deepest_coded = every("classification", DEEPEST, ("as coded",))
+GRADIENT = ("as written", "ours")
+recall_by_gradient = every("recall", EVEN, GRADIENT, trainer="gradient")
 
 
-def cells(budget: str) -> list[Cell]:
+def with_free_ties(budget: str) -> list[Cell]:
     """The published rule for ties is not known: the author's operators also run where any answer
     is right at a tie, as in the author's program."""
-    (coded,) = deepest(budget, ("as coded",))
+    (coded,) = deepest_coded(budget)
     free = replace(coded.algorithm, env=replace(coded.algorithm.env, ties="free"))
     labels = {**coded.labels, "ties free": True}
-    return [*evolved(budget), replace(coded, labels=labels, algorithm=free)]
+    by_depth = every("classification", CLASSIFICATION, PRESETS)
+    return [*by_depth(budget), replace(coded, labels=labels, algorithm=free)]
 
 
 def success(trained: Trained) -> list[Row]:
     """Strict success of the final champions on the same fresh sequences: the share of them that is
     answered right at every signal. No training run draws from the seed used here."""
     found = evaluate(trained.env, trained.champions, TEST, key=jax.random.key(10_000))
-    share = rounded(jnp.mean(found.returns["success"], axis=1))
-    return rows("success", share, trained.labels, seed=trained.seeds)
+    return trained.rows("success", jnp.mean(found.returns["success"], axis=1), 4)
 
 
 def baseline(trained: Trained) -> list[Row]:
     """The best of three policies that keep at most one signal (the first, the last, none)."""
     policy, value = floors.floor(trained.env)
-    return [Row({**trained.labels, "policy": policy}, None, "baseline success", round(value, 4))]
+    return [trained.fact("baseline success", round(value, 4), policy=policy)]
 
 
 def learning(trained: Trained) -> list[Row | Series]:
     """Each generation's champion on its 50 fresh sequences, as logged: raw, and smoothed by the
     author's moving average over 100 generations; every tenth generation, and the last one."""
-    scores = np.stack([run.metrics["champion_score"] for run in trained.runs])
-    at, found = np.arange(10, scores.shape[1] + 1, 10), []
-    axes: dict[str, Any] = {"labels": trained.labels, "seed": trained.seeds}
+    scores, found = trained.scores, []
+    at = np.arange(10, scores.shape[1] + 1, 10)
     for kind, x in (("", scores), (", smoothed", statistics.moving_average(scores, 100))):
-        x = rounded(x)
-        found += series(f"test success{kind}", "generation", at, x[:, at - 1], **axes)
-        found += rows(f"last test success{kind}", x[:, -1], **axes)
+        found += trained.series(f"test success{kind}", ("generation", at), x[:, at - 1], 4)
+        found += trained.rows(f"last test success{kind}", x[:, -1], 4)
     return found
 
 
-def rounded(x: Any, digits: int = 4) -> np.ndarray:
-    """Short enough for a text file."""
-    return np.round(np.asarray(x, np.float64), digits)
-
-
-def learned(**fields: Any) -> Curves:
+def curves(**fields: Any) -> Curves:
     """A figure of success, from 0 to 1."""
     return Curves(**{"line": LINE, "y_range": (0.0, 1.02)} | fields)
 
 
 MEASURES = (baseline, success, learning)
-SUMMARY = learned(y="success", x="depth", title="Final champions on 1,000 fresh sequences")
-BY_DEPTH = learned(
+SUMMARY = curves(y="success", x="depth", title="Final champions on 1,000 fresh sequences")
+BY_DEPTH = curves(
     y="test success, smoothed",
     x="generation",
     line=("depth",),
@@ -145,8 +154,8 @@ BY_DEPTH = learned(
 )
 TABLE = Table(
     "Success, %",
-    rows=("depth", *LINE),
-    columns={
+    ("depth", *LINE),
+    {
         "baseline": known("baseline success", 100),
         "published": published("success"),
         "measured": mean("success", 100, 1),
@@ -158,14 +167,17 @@ TABLE = Table(
     caption="Baseline: the best of three policies that keep at most one signal (the first, the "
     "last, none), computed exactly. Published: mean ± standard error.",
 )
-EXPERIMENT = Experiment(
-    **told("fig-3.4a"),
-    cells=cells,
-    measures=MEASURES,
-    views=(
-        replace(SUMMARY, levels={"published, 21-deep": constant(0.876)}),
-        BY_DEPTH,
-        TABLE,
-        notes("fig-3.4a"),
+BOTH = ("as coded", "ours")
+PUBLISHED = replace(SUMMARY, levels={"published, 21-deep": constant(0.876)})
+EXPERIMENTS = {
+    "fig-3.4a": Experiment(with_free_ties, MEASURES, (PUBLISHED, BY_DEPTH, TABLE)),
+    "fig-3.4b": Experiment(
+        every("classification", COMPARED, BOTH, NETWORKS), MEASURES, (SUMMARY, TABLE)
     ),
-)
+    "fig-3.9a": Experiment(every("recall", RECALL, BOTH), MEASURES, (SUMMARY, BY_DEPTH, TABLE)),
+    "fig-3.9b": Experiment(
+        every("recall", RECALL | {"quick": (2, 4, 6)}, networks=NETWORKS),
+        MEASURES,
+        (SUMMARY, TABLE),
+    ),
+}

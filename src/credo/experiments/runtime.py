@@ -6,14 +6,13 @@ import numpy as np
 
 from ..algorithms.erl import ERL
 from ..algorithms.off_policy import OffPolicy
-from ..analysis import attribution
 from ..report import sections as page
-from ..report.rows import Results, Row, rows
+from ..report.rows import Results, Row
 from ..runs import log
 from ..runs.loop import Run
 from .base import Cell, Experiment, Trained, Value
-from .dissertation import notes, told
-from .fig_5_3 import Plan, cell, tasks
+from .mujoco import cell, tasks
+from .plans import Plan
 from .views import Table, mean, per_seed
 
 PLANS = {"smoke": Plan(600, 2), "quick": Plan(60_000, 2), "full": Plan(200_000, 3)}
@@ -29,7 +28,7 @@ def cells(budget: str) -> list[Cell]:
     return [
         Cell({"method": x, "task": task, "untested": True}, c.algorithm, c.seeds, frames=c.frames)
         for x, build in {"erl": ERL.erl, "ddpg": OffPolicy.ddpg}.items()
-        for c in [cell(x, build, task, budget, planned=PLANS[budget], test_every=NEVER)]
+        for c in [cell(x, build, task, budget, runs=PLANS[budget], test_every=NEVER)]
     ]
 
 
@@ -37,8 +36,7 @@ def times(cell: Trained) -> Iterable[Row]:
     """What the clock says of each run."""
     found = [rates(run) for run in cell.runs]
     for name in found[0]:
-        values = attribution.plain([x[name] for x in found], 6)
-        yield from rows(name, values, cell.labels, seed=cell.seeds)
+        yield from cell.rows(name, [x[name] for x in found], 6)
 
 
 def rates(run: Run) -> dict[str, float]:
@@ -81,6 +79,4 @@ CLOCK = Table(
     caption="Updates and time per frame after the first quarter of each run, so that compiling "
     "does not count.",
 )
-EXPERIMENT = Experiment(
-    **told("note-5.5"), cells=cells, measures=(times,), views=(CLOCK, extra, notes("mujoco"))
-)
+EXPERIMENTS = {"note-5.5": Experiment(cells, (times,), (CLOCK, extra))}

@@ -1,7 +1,7 @@
-"""Table 4.1: a fleet with three memory cells, in every configuration of the case study."""
+"""Table 4.1 and Figure 4.8: a fleet of two servers and three memory cells in every configuration of
+the case study; who writes what to the shared memory, and when."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +12,12 @@ from ..environments.server_fleet import ServerFleet
 from ..evolution.mutation import MatrixMutation
 from ..networks.dmmu import DMMU
 from ..report import sections as page
-from ..report.rows import Results, Row, Series, rows, series
+from ..report.rows import Results, Row, Series
 from .base import Cell, Experiment, Trained, Value
-from .dissertation import notes, told
-from .fig_3_4a import rounded
-from .fig_4_2 import BUDGETS
-from .fig_4_7 import cell, references
-from .table_3_1 import best_seed, names, of_best
-from .views import Of, Runs, Table, computed, each, known, of_metric, published
+from .fleets import cell, references
+from .memories import best_seed, names, of_best, write_map
+from .tmazes import BUDGETS
+from .views import SEED, Of, Table, each, known, of_metric, plain, published
 
 CONFIGURATIONS = ("GGNN", "NNGG", "NGGN", "GNNG", "GNGN", "NGNG")  # G: genuine, N: nefarious
 PLANS = {"smoke": (4, 2), "quick": (300, 2), "full": (2_000, 10), "published": (15_000, 10)}
@@ -47,28 +45,27 @@ def played(trained: Trained) -> Iterator[Row | Series]:
             genuine = jnp.array([letter == "G" for letter in letters])
             found = fleet.trace_fleet(trained.env, run.champion, genuine, key=jax.random.key(0))
             totals[i] += np.sum(found.net)
-            labels = {**trained.labels, "configuration": letters}
-            yield from episode(found, {"labels": labels, "seed": [trained.seeds[i]]})
-    yield Row(trained.labels, None, "best run", int(np.argmax(totals)))
+            yield from episode(trained.part(trained.seeds[i], configuration=letters), found)
+    yield trained.fact("best run", int(np.argmax(totals)))
 
 
-def episode(found: fleet.FleetTrace, axes: dict[str, Any]) -> Iterator[Row | Series]:
-    """Reward, final memory, its order (the signature); and by step and server the device that was
-    chosen (-1: none, the server is told what its request was worth), and what was written."""
-    cells, steps = names(found.memory.shape[1]), range(1, len(found.acting) + 1)
-    yield from rows("reward", [float(np.sum(found.net))], **axes)
-    yield from rows("memory", rounded(found.memory[-1:]), **axes, cell=cells)
-    yield from rows("signature", np.asarray(found.signature)[None], **axes, rank=None)
+def episode(one: Trained, found: fleet.FleetTrace) -> Iterator[Row | Series]:
+    """Of one run: reward, final memory, its order (the signature); and by step and server the
+    device that was chosen (-1: none, the server is told what its request was worth), and what was
+    written."""
+    cells, at = names(found.memory.shape[1]), ("step", range(1, len(found.acting) + 1))
+    yield from one.rows("reward", [float(np.sum(found.net))])
+    yield from one.rows("memory", found.memory[-1:], 4, cell=cells)
+    yield from one.rows("signature", np.asarray(found.signature)[None], rank=None)
     chosen = np.where(found.acting, found.device, -1).T[None]
-    yield from series("device", "step", steps, chosen, **axes, server="AB")
-    writes = rounded(np.abs(found.writes)).transpose(1, 2, 0)[None]
-    yield from series("write", "step", steps, writes, **axes, server="AB", cell=cells)
+    yield from one.series("device", at, chosen, server="AB")
+    writes = np.abs(found.writes).transpose(1, 2, 0)[None]
+    yield from one.series("write", at, writes, 4, server="AB", cell=cells)
 
 
 def upper_bound(trained: Trained) -> list[Row]:
     """The most that a fleet that does not know the classes can reach on average, exactly."""
-    bound = round(fleet.best_discovery(trained.env), 4)
-    return [Row(trained.labels, None, "upper bound", bound)]
+    return [trained.fact("upper bound", round(fleet.best_discovery(trained.env), 4))]
 
 
 def as_published(results: Results, values: Sequence[Value]) -> page.Cell:
@@ -105,19 +102,40 @@ def best(results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
     return of_best(Table(title, ("configuration",), columns, caption=caption))(results, values)
 
 
-RUNS = Runs(
+def heat_maps(results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
+    """Writes of each server of the best champion, by step and memory cell, in the configuration of
+    section 4.2.4."""
+    for server in results.levels("server"):
+        here = results.where(configuration="NGGN", server=server)
+        (devices,) = of_metric(here, "device").curves
+        chosen = [f"device {x}" if x >= 0 else "told" for x in devices.values]
+        words = [f"t={t}: {word}" for t, word in zip(devices.at, chosen, strict=True)]
+        title, writes = f"Server {server}: magnitude of its writes", of_metric(here, "write").curves
+        yield write_map(title, writes, dict(enumerate(words)), "step")
+
+
+def share_when_told(results: Results, values: Sequence[Value]) -> page.Cell:
+    """The share of a run's writing that happens when a server is told, in percent."""
+    dims = ("configuration", "server")
+    when = results.array("device", *dims).astype(int) < 0
+    writes = results.array("write", *dims, "cell").astype(np.float64).sum(axis=2)
+    return f"{100 * writes[when].sum() / writes.sum():.1f}"
+
+
+EVERY_RUN = Table(
     "Every run",
+    [SEED],
     {
         "rewards": each("reward", form="g"),
-        "mean": computed("reward", np.mean),
+        "mean": plain("reward"),
         "as Table 4.1 or better": as_published,
         "different signatures": signatures,
     },
 )
 BOUNDS = Table(
     "Baselines and bounds: mean reward",
-    rows=("task",),
-    columns={
+    ("task",),
+    {
         "random servers": known("reference", policy="random"),
         "one action": known("reference", policy="fixed"),
         "a script that discovers": known("reference", policy="discovering"),
@@ -127,11 +145,14 @@ BOUNDS = Table(
     caption="Whoever knows the classes has 6 in each configuration. A fleet has to find out: on "
     "average no fleet has more than the mean of the published table, 28/6.",
 )
-MEASURES = (played, upper_bound, references)
-EXPERIMENT = Experiment(
-    **told("table-4.1"),
-    budgets=BUDGETS,
-    cells=cells,
-    measures=MEASURES,
-    views=(best, RUNS, BOUNDS, notes("case study")),
+SHARES = Table(
+    "Share of all writing that happens when a server is told what its request was worth",
+    [SEED],
+    {"share, %": share_when_told},
+    caption="Over the six configurations; half of the steps are of that kind.",
 )
+MEASURES = (played, upper_bound, references)
+EXPERIMENTS = {
+    "fig-4.8": Experiment(cells, MEASURES, (of_best(heat_maps), SHARES), BUDGETS),
+    "table-4.1": Experiment(cells, MEASURES, (best, EVERY_RUN, BOUNDS), BUDGETS),
+}

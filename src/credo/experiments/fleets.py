@@ -21,12 +21,10 @@ from ..networks.dmmu import DMMU, DMMUPolicy
 from ..networks.mlp import MLP
 from ..networks.recurrent import Recurrent
 from ..networks.team import Centralized, Team
-from ..report.rows import Row, Series, rows
-from ..rollout import evaluate
+from ..report.rows import Row
 from .base import Cell, Experiment, Trained
-from .dissertation import notes, told
-from .fig_3_4a import rounded
-from .fig_4_2 import BUDGETS, SMOOTHED, learned
+from .measures import final, returns
+from .tmazes import BUDGETS, SMOOTHED, smoothed
 from .views import Curves, Table, known, mean, median, published
 
 EPISODES = 500  # fresh ones for a final champion; the dissertation used 10
@@ -101,11 +99,6 @@ def cells(budget: str) -> list[Cell]:
     return found
 
 
-def net(trained: Trained) -> list[Row | Series]:
-    """Net requests that the final champions serve in fresh episodes, and their tests."""
-    return learned(trained, METRIC, "net", EPISODES, 3)
-
-
 def clear(env: ServerFleet | NoisyObservations) -> ServerFleet:
     """A fleet's task without noise."""
     found = env.env if isinstance(env, NoisyObservations) else env
@@ -121,7 +114,7 @@ def _references(env: ServerFleet) -> dict[str, tuple[float, float]]:
 def references(trained: Trained) -> list[Row]:
     """Mean net requests of baselines, of a script that discovers, and of an oracle."""
     return [
-        Row({**trained.labels, "policy": name}, None, "reference", round(value, 2))
+        trained.fact("reference", round(value, 2), policy=name)
         for name, (value, _) in _references(clear(trained.env)).items()
     ]
 
@@ -132,9 +125,8 @@ def nobody_writes(trained: Trained) -> list[Row]:
     if not all(isinstance(team, DMMUPolicy) and team.config.cell == "mmu" for team in teams):
         return []
     silent = tree.stack(*map(fleet.without_writing, teams))
-    played = evaluate(trained.env, silent, EPISODES, key=jax.random.key(20_000))
-    found = rounded(np.mean(played.of("net"), axis=1), 3)
-    return rows(f"{METRIC} while nobody writes", found, trained.labels, seed=trained.seeds)
+    played = returns(trained.env, silent, EPISODES, reward="net")
+    return trained.rows(f"{METRIC} while nobody writes", np.mean(played, axis=1), 3)
 
 
 CURVES = Curves(
@@ -151,8 +143,8 @@ CURVES = Curves(
 )
 SCORES = Table(
     "Genuine minus nefarious requests that the final champion serves",
-    rows=("timing", "network", "noise"),
-    columns={
+    ("timing", "network", "noise"),
+    {
         "baseline: random": known("reference", policy="random"),
         "baseline: one action": known("reference", policy="fixed"),
         "published": published(METRIC),
@@ -167,11 +159,10 @@ SCORES = Table(
     "the classes. While nobody writes a DMMU has no memory, neither of others nor of its own, but "
     "the last output.",
 )
-MEASURES = (references, net, nobody_writes)
-EXPERIMENT = Experiment(
-    **told("fig-4.7"),
-    budgets=BUDGETS,
-    cells=cells,
-    measures=MEASURES,
-    views=(SCORES, CURVES, notes("fleets", "fig-4.7")),
+MEASURES = (
+    references,
+    final(METRIC, EPISODES, 3, each=False, reward="net"),
+    smoothed(METRIC, 2),
+    nobody_writes,
 )
+EXPERIMENTS = {"fig-4.7": Experiment(cells, MEASURES, (SCORES, CURVES), BUDGETS)}

@@ -1,7 +1,7 @@
-"""Figure 4.2: Converge, a learning robot beside a static one. Also what all T-mazes of chapter 4
-share: cells, measurements, pictures, the table."""
+"""Figures 4.2 to 4.4: robots in Extended T-Mazes, beside a static one (Converge and Spread) and in
+teams that learn. Also the budgets and learning curves of all of chapter 4."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -20,13 +20,11 @@ from ..networks.mmu import MMU
 from ..networks.recurrent import Recurrent
 from ..report import mazes
 from ..report import sections as page
-from ..report.rows import Results, Row, Series, rows, series
-from ..rollout import evaluate
-from .base import Cell, Experiment, Trained, Value, named
-from .dissertation import notes, told
-from .fig_3_4a import rounded
-from .table_3_1 import names
-from .views import Curves, Table, combinations, known, mean, median, of_metric, present, published
+from ..report.rows import Results, Row, Series
+from .base import Cell, Experiment, Measure, Trained, Value, named, rounded
+from .measures import returns
+from .memories import names
+from .views import Curves, Table, known, mean, median, of_metric, panels, present, published
 
 BUDGETS = ("smoke", "quick", "full", "published")
 POINTS, SMOOTHED = 100, 100  # of a learning curve; generations of the author's moving average
@@ -55,15 +53,17 @@ LINE = ("network", "fitness")
 METRIC = "share of trials"
 EPISODE = ("goal", "observed", "partner", "endpoint", "company", "reward")
 OF_ROBOTS = ("endpoint", "company", "reward")
+Task = Literal["converge", "spread"]
+Partner = Literal["fsp", "resp"]
 
 
 def cell(
     budget: str,
-    task: Literal["converge", "spread"],
+    task: Task,
     depth: int,
     network: str,
     *,
-    partner: Literal["fsp", "resp"] | None = None,
+    partner: Partner | None = None,
     robots: int = 1,
     fitness: str | None = None,
 ) -> Cell:
@@ -100,80 +100,75 @@ def full(env: ExtendedTMaze, network: str) -> tuple[int, int]:
     return (LONGER[env.partner] if late and env.partner else 2_000), 3
 
 
-def beside_a_static_robot(task: Literal["converge", "spread"], budget: str) -> list[Cell]:
-    """Figures 4.2 and 4.3: a learning robot beside a static one, by depth, kind and network."""
-    partners: tuple[Literal["fsp", "resp"], ...] = ("fsp", "resp")
-    return [
-        cell(budget, task, depth, network, partner=partner)
-        for depth in ((2,) if budget == "smoke" else (2, 3))
-        for partner in partners
-        for network in ("mmu", "ff")
-    ]
+def every(task: Task, **places: Sequence[Any]) -> Callable[[str], list[Cell]]:
+    """Cells of both networks at both depths, by budget. `places`: partners or sizes of a team, of
+    which smoke has what costs little: one depth, both partners and the smallest team."""
+
+    def cells(budget: str) -> list[Cell]:
+        ((name, chosen),) = places.items()
+        smoke = budget == "smoke"
+        return [
+            cell(budget, task, depth, network, **{name: place})
+            for depth in ((2,) if smoke else (2, 3))
+            for place in (chosen[:1] if smoke and name == "robots" else chosen)
+            for network in ("mmu", "ff")
+        ]
+
+    return cells
 
 
-def cells(budget: str) -> list[Cell]:
-    """Converge."""
-    return beside_a_static_robot("converge", budget)
+def smoothed(metric: str, digits: int) -> Measure:
+    """The champions' tests on the way, smoothed by the author's moving average."""
 
+    def measure(trained: Trained) -> list[Series]:
+        scores = trained.scores
+        at = np.unique(np.linspace(0, scores.shape[1] - 1, POINTS).astype(int))
+        values = statistics.moving_average(scores, SMOOTHED)[:, at]
+        return trained.series(f"test {metric}, smoothed", ("generation", at + 1), values, digits)
 
-def learned(
-    trained: Trained, metric: str, reward: str, episodes: int, digits: int
-) -> list[Row | Series]:
-    """The final champions in fresh episodes that all of them share, and the champions' tests on
-    the way, smoothed by the author's moving average."""
-    played = evaluate(trained.env, trained.champions, episodes, key=jax.random.key(20_000))
-    final = rounded(np.mean(played.of(reward), axis=1), digits)
-    scores = np.stack([run.metrics["champion_score"] for run in trained.runs])
-    at = np.unique(np.linspace(0, scores.shape[1] - 1, POINTS).astype(int))
-    smoothed = rounded(statistics.moving_average(scores, SMOOTHED)[:, at], digits - 1)
-    axes: dict[str, Any] = {"labels": trained.labels, "seed": trained.seeds}
-    lines = series(f"test {metric}, smoothed", "generation", at + 1, smoothed, **axes)
-    return [*rows(metric, final, **axes), *lines]
+    return measure
 
 
 def levels(trained: Trained) -> list[Row]:
     """Exact shares of policies that take no learning, and what no policy can pass."""
-    env, labels = trained.env, trained.labels
+    env = trained.env
     # Every endpoint is as likely as any other; without memory there are the first and the last.
     team = {"one at each end": min(2, env.robots) / env.endpoints}
     known = tmaze.floors(env) if env.robots == 1 else team
     kind, bound = tmaze.ceiling(env)
-    baselines = [Row({**labels, "policy": k}, None, "baseline", round(known[k], 4)) for k in known]
-    return [*baselines, Row({**labels, "kind": kind}, None, "upper bound", round(bound, 4))]
+    baselines = [trained.fact("baseline", round(known[k], 4), policy=k) for k in known]
+    return [*baselines, trained.fact("upper bound", round(bound, 4), kind=kind)]
 
 
 def shares(trained: Trained) -> Iterator[Row | Series]:
     """Shares of trials in which the reward is observed, in 1,000 fresh episodes (the dissertation
     used 15); and one episode of the best champion, if it has memory."""
-    found = learned(trained, METRIC, "score", 1000, 4)
-    yield from found
-    final = [-np.inf if row.value is None else row.value for row in found if isinstance(row, Row)]
-    best = int(np.argmax(final))
+    final = returns(trained.env, trained.champions, 1000, reward="score").mean(axis=1)
+    yield from trained.rows(METRIC, final, 4)
+    best = int(np.argmax(np.where(np.isfinite(final), rounded(final, 4), -np.inf)))
     champion, key = trained.runs[best].champion, jax.random.key(20_001)
     if jax.tree.leaves(champion.start(key=key)):
-        yield Row(trained.labels, None, "best run", best)
+        yield trained.fact("best run", best)
         trace = maze_trace.trace_maze(trained.env, champion, key=key)
         yield from episode(trained, trained.seeds[best], trace.plain(trained.env))
 
 
 def episode(trained: Trained, seed: int, played: dict[str, Any]) -> Iterator[Series]:
     """An episode, trial by trial. Of a team without its memories: too much for a page."""
-    axes: dict[str, Any] = {"labels": trained.labels, "seed": [seed]}
-    at, robots = range(1, trained.env.trials + 1), range(1, trained.env.robots + 1)
+    at, robots = ("trial", range(1, trained.env.trials + 1)), range(1, trained.env.robots + 1)
+    one = trained.part(seed)
     for metric in EPISODE:
         each: dict[str, Any] = {"robot": robots} if metric in OF_ROBOTS else {}
         if played[metric] is not None:
-            yield from series(metric, "trial", at, [played[metric]], **axes, **each)
+            yield from one.series(metric, at, [played[metric]], **each)
     if len(robots) == 1:
-        axes |= {"robot": robots, "cell": names(len(played["memory"][0]))}
-        yield from series("memory", "trial", at, [played["memory"]], **axes)
+        cells = names(len(played["memory"][0]))
+        yield from one.series("memory", at, [played["memory"]], robot=robots, cell=cells)
 
 
 def pictures(results: Results, values: Sequence[Value]) -> Iterator[page.Section]:
     """An episode of the best final champion of each cell that has memory."""
-    for key in combinations(results, (*PLACE, *LINE)):
-        labels: dict[str, Any] = dict(zip((*PLACE, *LINE), key, strict=True))
-        here = results.where(**labels)
+    for labels, here in panels(results, (*PLACE, *LINE)):
         curves = {x: of_metric(here, x).curves for x in (*EPISODE, "memory")}
         if not curves["goal"]:
             continue
@@ -207,8 +202,8 @@ def of_the_bound(results: Results, values: Sequence[Value]) -> page.Cell:
 
 SCORES = Table(
     "Share of trials in which the final champion team observes the reward, %",
-    rows=(*PLACE, *LINE),
-    columns={
+    (*PLACE, *LINE),
+    {
         "baseline: best without memory": without_memory,
         "published": published(METRIC),
         "measured": mean(METRIC, 100, 1),
@@ -232,12 +227,12 @@ CURVES = Curves(
     caption=f"The champion team of each generation; mean of {SMOOTHED} generations, as the "
     "author's.",
 )
-MEASURES = (levels, shares)
-VIEWS = (SCORES, CURVES, pictures)
-EXPERIMENT = Experiment(
-    **told("fig-4.2"),
-    budgets=BUDGETS,
-    cells=cells,
-    measures=MEASURES,
-    views=(*VIEWS, notes("T-mazes", "fig-4.2")),
-)
+MEASURES = (levels, shares, smoothed(METRIC, 3))
+EXPERIMENTS = {
+    name: Experiment(cells, MEASURES, (SCORES, CURVES, pictures), BUDGETS)
+    for name, cells in {
+        "fig-4.2": every("converge", partner=("fsp", "resp")),
+        "fig-4.3": every("spread", partner=("fsp", "resp")),
+        "fig-4.4": every("spread", robots=(2, 3, 4)),
+    }.items()
+}
