@@ -389,7 +389,8 @@ def test_evaluate_plays_fresh_episodes_of_any_depth(credo, run):
         "accuracy",
         "success",
         "steps",
-        "floor",
+        "baseline",
+        "upper",
     ]
     assert 3 <= float(lines[4].split()[1]) <= 4  # depth 2, a gap of 1 or 2
     assert credo(f"evaluate {run} --episodes 40")[1] == out

@@ -123,13 +123,7 @@ class ExtendedTMaze(AbstractEnvironment):
     def __check_init__(self):
         require.within("depth", self.depth, 1, DEEPEST)
         require.at_least("robots", self.robots, 1)
-        require.choice("objective", self.objective, ("converge", "spread"))
-        if self.partner is not None:
-            require.choice("partner", self.partner, ("fsp", "resp"))
-        require.choice("presence", self.presence, ("others", "as-coded"))
-        require.choice("feedback", self.feedback, ("objective", "own"))
-        require.choice("moves", self.moves, ("uniform", "as-coded"))
-        require.choice("counterfactual", self.counterfactual, ("absent", "random"))
+        require.literals(self)
         if len(self.corridor) != 2 or not 1 <= self.corridor[0] <= self.corridor[1]:
             raise ValueError(
                 f"corridor is {self.corridor}: give (shortest, longest) in steps, at least 1 each, "
@@ -250,16 +244,16 @@ class ExtendedTMaze(AbstractEnvironment):
             "maze",
             f"{robots}{beside}, {self.depth}-deep, {self.objective.capitalize()}: the reward is "
             f"observed if {rule} at its endpoint.",
-            self._shown,
+            self.shown,
             {"depth": self.depth},
             tuple(mark for mark in marks if self.partner or mark.text != "static robot"),
             agent="robot",
         )
 
-    def _shown(self, trace: Trace) -> dict[str, Any]:
-        """At every moment: the trial, how far everybody is on the way (`part` of the corridor
+    def shown(self, trace: Trace) -> dict[str, Any]:
+        """At every moment: the trial, how far each robot is on the way (`part` of the corridor
         behind `level` turns, of which `turns` has the bits), and where the static robot goes; for
-        every trial where everybody went, and what they were told."""
+        every trial where each robot went (`static`: the static one), and what they were told."""
         state = trace.states
         ends = np.flatnonzero(np.diff(state.trial)) + 1  # moments at which a trial is over
         over = np.isin(np.arange(len(state.trial)), ends)

@@ -39,6 +39,11 @@ def _plain(value: Any) -> bool:
     return value is None or isinstance(value, str | int | float)
 
 
+def _told(name: str) -> Any:
+    """A property that only the environment itself can tell."""
+    return property(lambda self: self._sizes()[name])
+
+
 class AbstractForeignEnvironment(AbstractHostEnvironment):
     """An environment made by name, whose copies are stepped in a worker process."""
 
@@ -77,25 +82,11 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
         if not self.timeout > 0:
             raise ValueError(f"timeout is {self.timeout}: it must be more than 0 seconds")
 
-    @property
-    def obs_size(self) -> int:
-        return self._sizes()["obs_size"]
-
-    @property
-    def action_size(self) -> int:
-        return self._sizes()["action_size"]
-
-    @property
-    def max_steps(self) -> int:
-        return self._sizes()["max_steps"]
-
-    @property
-    def obs_dtype(self) -> str:
-        return self._sizes()["obs_dtype"]
-
-    @property
-    def discrete(self) -> bool:
-        return bool(self._sizes()["discrete"])
+    obs_size = _told("obs_size")
+    action_size = _told("action_size")
+    max_steps = _told("max_steps")
+    obs_dtype = _told("obs_dtype")
+    discrete = _told("discrete")
 
     def spec(self) -> dict[str, Any]:
         """What a worker must know to open it, as JSON has it."""

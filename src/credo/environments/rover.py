@@ -164,10 +164,7 @@ class Rover(AbstractEnvironment):
     def __check_init__(self):
         for name in ("pois", "coupling", "max_steps", "harvest_period"):
             require.at_least(name, getattr(self, name), 1)
-        require.choice("local", self.local, ("distance", "unobserved", "closeness", "progress"))
-        require.choice("observation", self.observation, ("relative", "as-coded"))
-        require.choice("motion", self.motion, ("as-written", "as-coded"))
-        require.choice("start", self.start, ("continuous", "as-coded"))
+        require.literals(self)
         for name in ("size", "activation_distance", "max_speed"):
             require.at_least(name, getattr(self, name), 1e-6)
         if self.agents < self.coupling:

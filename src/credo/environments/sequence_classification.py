@@ -56,7 +56,7 @@ class SequenceClassification(AbstractSequenceTask):
                 f"gaps of {self.min_gap}..{self.max_gap} zeros: needs 0 <= min_gap <= max_gap"
             )
         require.within("persistence", self.persistence, 0, 1)
-        require.choice("ties", self.ties, ("positive", "free"))
+        require.literals(self)
 
     @property
     def obs_size(self) -> int:

@@ -107,8 +107,7 @@ class ServerFleet(AbstractEnvironment):
     def __check_init__(self):
         for name in ("servers", "devices", "requests", "max_steps"):
             require.at_least(name, getattr(self, name), 1)
-        require.choice("observation", self.observation, ("signed one-hot", "scalar"))
-        require.choice("told", self.told, ("once", "until-action"))
+        require.literals(self)
         low, high = span(self.nefarious)
         if not 0 <= low <= high <= self.devices:
             raise ValueError(

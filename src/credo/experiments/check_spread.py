@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import tree
 from ..algorithms.off_policy import OffPolicy
-from ..analysis import planner
+from ..analysis import scripts
 from ..environments.simple_spread import SimpleSpread
 from ..learners.td3 import maddpg, matd3
 from ..networks.exploration import GaussianNoise
@@ -63,7 +63,7 @@ def build(method: str, plan: Plan) -> OffPolicy:
 @functools.cache
 def random(env: SimpleSpread) -> dict[str, float]:
     """Mean return of actions drawn uniformly."""
-    team = tree.stack(planner.RandomTeam(env.agents))
+    team = tree.stack(scripts.random_team(env))
     played = measures.returns(env, team, EPISODES, measures.BASELINE_KEY)
     return {"random": round(float(np.mean(played)), 2)}
 

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from ..analysis import floors
+from ..analysis import bounds
 from ..analysis.generalization import first_mistakes
+from ..environments.sequence_classification import SequenceClassification
 from ..report import sections as page
 from ..report.rows import Results, Series, series
 from .base import Experiment, Trained, Value
@@ -42,7 +43,7 @@ def curves(title: str, published: float) -> Curves:
 
 def baselines(results: Results, values: Sequence[Value]) -> list[page.Section]:
     """Exact success without counting, at the depths of the table."""
-    found = [100 * max(floors.classification_floors(depth).values()) for depth in SHOWN]
+    found = [100 * bounds.best_baseline(SequenceClassification(x))[1] for x in SHOWN]
     title = "Baseline: the best policy that keeps at most one signal, %"
     return [page.Table(title, [f"at {x}" for x in SHOWN], [[f"{x:.1f}" for x in found]])]
 

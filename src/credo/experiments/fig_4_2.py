@@ -10,7 +10,7 @@ import numpy as np
 
 from ..algorithms.ccea import CCEA
 from ..algorithms.neuroevolution import author_mutation
-from ..analysis import maze_trace, statistics, tmaze
+from ..analysis import bounds, maze_trace, statistics, tmaze
 from ..environments.extended_tmaze import ExtendedTMaze
 from ..evolution.breeder import altered
 from ..evolution.islands import Islands
@@ -132,12 +132,9 @@ def learned(
 
 
 def levels(trained: Trained) -> list[Row]:
-    """Exact shares of policies that take no learning, and what no policy can pass."""
+    """Exact shares of policies that take no learning, and their upper bound."""
     env, labels = trained.env, trained.labels
-    # Every endpoint is as likely as any other; without memory there are the first and the last.
-    team = {"one at each end": min(2, env.robots) / env.endpoints}
-    known = tmaze.floors(env) if env.robots == 1 else team
-    kind, bound = tmaze.ceiling(env)
+    known, (bound, kind) = bounds.baselines(env), bounds.upper_bound(env)
     baselines = [Row({**labels, "policy": k}, None, "baseline", round(known[k], 4)) for k in known]
     return [*baselines, Row({**labels, "kind": kind}, None, "upper bound", round(bound, 4))]
 

@@ -48,7 +48,7 @@ class Team(AbstractNetwork):
     def __check_init__(self):
         for i, units in enumerate(self.trunk):
             require.at_least(f"trunk[{i}]", units, 1)
-        require.choice("sharing", self.sharing, ("trunk", "everything", "nothing"))
+        require.literals(self)
         require.choice("activation", self.activation, ACTIVATIONS)
         require.choice("initializer", self.initializer, (*INITIALIZERS, "uniform"))
 

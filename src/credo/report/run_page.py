@@ -13,10 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..algorithms.lineage import MAKERS
-from ..analysis import attribution, floors
-from ..environments.base import AbstractSequenceTask
-from ..environments.sequence_classification import SequenceClassification
-from ..environments.sequence_recall import SequenceRecall
+from ..analysis import attribution, bounds
 from ..learners.base import AbstractLearner
 from ..runs import config
 from ..runs.record import RunError
@@ -241,29 +238,29 @@ def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
 
 
 def _bounds(run: Run) -> tuple[Reference, Reference] | None:
-    """The best trivial policy and the upper bound of a run's task, where Credo may know them. No
-    other task is made: that might run somebody's code."""
+    """The best baseline and the upper bound of a run's task, where they are known exactly. No
+    other task is made: that might run code of others."""
     recorded = run.config["algorithm"]["env"]
-    ours = map(config.class_name, (SequenceClassification, SequenceRecall))
-    task: AbstractSequenceTask | None = (
-        config.from_tree(recorded) if recorded["class"] in ours else None
-    )
-    if task is None or not floors.known(task):
+    if recorded["class"] not in map(config.class_name, bounds.EXACT):
         return None
-    name, value = floors.floor(task)
-    return Reference(f"baseline: {name}", value), Reference("upper bound", floors.CEILING)
+    task = config.from_tree(recorded)
+    if not bounds.exact(task):
+        return None
+    name, value = bounds.best_baseline(task)
+    highest = bounds.upper_bound(task).value
+    return Reference(f"baseline: {name}", value), Reference("upper bound", highest)
 
 
 def _table(runs: Groups) -> Table:
     known = [_bounds(group[0]) for group in runs.values()]
     rows = []
-    for (label, group), bounds in zip(runs.items(), known, strict=True):
+    for (label, group), limits in zip(runs.items(), known, strict=True):
         scores = [float(run.metrics["champion_score"][-1]) for run in group]
         score = Summary(scores, [run.config["seed"] for run in group])
         last = min(int(run.metrics["generation"][-1]) for run in group)
         told: list[Cell] = [None, None]
-        if bounds is not None:
-            low, high = bounds
+        if limits is not None:
+            low, high = limits
             told = [f"{low.value:.3f} ({low.label.partition(': ')[2]})", high.value]
         rows.append([label, score, *(told if any(known) else ()), len(group), last])
     beside = ["baseline", "upper bound"] if any(known) else []
