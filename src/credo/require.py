@@ -17,10 +17,11 @@ def literals(config: Any) -> None:
     """Raise unless every field that is annotated as a `Literal` has one of its values, or None
     where the annotation allows it."""
     for field in dataclasses.fields(config):
-        value, kinds = getattr(config, field.name), (field.type, *get_args(field.type))
+        kinds = (field.type, *get_args(field.type))
+        none = getattr(config, field.name) is None and type(None) in kinds
         for kind in kinds:
-            if get_origin(kind) is Literal and not (value is None and type(None) in kinds):
-                choice(field.name, value, get_args(kind))
+            if get_origin(kind) is Literal and not none:
+                choice(field.name, getattr(config, field.name), get_args(kind))
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

@@ -55,7 +55,6 @@ class DiscoveringFleet(AbstractPolicy):
 
     chance: Float[Array, "devices+1 devices+1"]
     """Probability that an unknown device is genuine, by the genuine and nefarious ones found."""
-    servers: int = eqx.field(static=True)
     devices: int = eqx.field(static=True)
     requests: int = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
@@ -116,7 +115,7 @@ def discovering_fleet(env: ServerFleet) -> DiscoveringFleet:
             "the scripted fleet reads ServerFleet(observation='signed one-hot', status=True, "
             "scale=(1.0, 1.0)); the game is the same"
         )
-    sizes = (env.servers, env.devices, env.requests, env.max_steps)
+    sizes = (env.devices, env.requests, env.max_steps)
     chance = jnp.asarray(_chance(env.devices, *span(env.nefarious)), jnp.float32)
     return DiscoveringFleet(chance, *sizes, cycle=1.0 + sum(span(env.busy)) / 2)
 
@@ -188,7 +187,7 @@ def best_discovery(env: ServerFleet) -> float:
     """The most net requests, on average, that any fleet can serve without knowing the classes.
 
     By search over all joint choices of a fleet that shares everything at once, which no fleet can
-    surpass: 14/3 for the case study, of which the scripted fleet earns 4.3.
+    surpass: 14/3 for the case study, of which the scripted fleet serves 4.3.
 
     ValueError unless all servers act at the same steps (one number of busy steps, no schedule), or
     if there are too many choices.

@@ -31,6 +31,14 @@ LASTING = {
 """Wrappers whose state outlives an episode, by class name, and what to use instead."""
 
 
+def _most_steps(limits: list[int | None], warnings: list[str]) -> int:
+    """The least of the limits that there are; a warning if there is none."""
+    known = [int(limit) for limit in limits if limit is not None]
+    if not known:
+        warnings.append(NO_LIMIT)
+    return min(known, default=MOST_STEPS)
+
+
 class Single:
     """What all copies of a Gymnasium environment have in common, taken from the first.
 
@@ -79,14 +87,12 @@ class Single:
             self._seen = mask is not None and mask.shape == (self.action_size,)
 
     def _limit(self, env: gymnasium.Env, limit: int | None) -> int:
-        limits = [] if limit is None else [limit]
+        limits = [limit]
         while isinstance(env, gymnasium.Wrapper):
             if isinstance(env, gymnasium.wrappers.TimeLimit):
                 limits.append(env._max_episode_steps)
             env = env.env
-        if not limits:
-            self.warnings.append(NO_LIMIT)
-        return min(limits, default=MOST_STEPS)
+        return _most_steps(limits, self.warnings)
 
     def reset(self, env: gymnasium.Env, seed: int, frame: Any, i: int) -> None:
         """A fresh episode of copy `i`, written to its row of the frame."""
@@ -104,11 +110,8 @@ class Single:
         obs, reward, terminated, truncated, info = result
         self.said[i] = obs
         self._write(obs, frame.obs[i])
-        frame.rewards["reward"][i] = reward if isinstance(reward, (float, int)) else _number(reward)
-        if terminated is not True and terminated is not False:
-            terminated = _flag("terminated", terminated)
-        if truncated is not True and truncated is not False:
-            truncated = _flag("truncated", truncated)
+        frame.rewards["reward"][i] = _number(reward)
+        terminated, truncated = _flag("terminated", terminated), _flag("truncated", truncated)
         frame.terminated[i], frame.truncated[i] = terminated, truncated
         over = terminated or truncated
         if self.discrete and not over:
@@ -196,11 +199,7 @@ class Team:
 
     def _cycles(self, env: Any, limit: int | None) -> int:
         """PettingZoo has no wrapper for time limits; `max_cycles` is its custom."""
-        limits = [limit, getattr(env.unwrapped, "max_cycles", None)]
-        limits = [int(limit) for limit in limits if limit is not None]
-        if not limits:
-            self.warnings.append(NO_LIMIT)
-        return min(limits, default=MOST_STEPS)
+        return _most_steps([limit, getattr(env.unwrapped, "max_cycles", None)], self.warnings)
 
     def _first_step(self, env: Any) -> tuple[list[str], Any, Any]:
         """Who acted in a first step with the middle of every Box, their rewards and infos."""

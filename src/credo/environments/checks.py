@@ -110,14 +110,12 @@ def _time_step(env: AbstractEnvironment, where: str, time_step: TimeStep) -> lis
         problems += _array(f"{where}: reward {name!r}", reward, shape, np.float32)
     for name in ("terminated", "truncated"):
         problems += _array(f"{where}: {name}", getattr(time_step, name), (), np.bool_)
-    if time_step.active is not None:
-        if not team:
-            problems.append(f"{where}: active is for teams: leave it None, or set agents")
-        problems += _array(f"{where}: active", time_step.active, team, np.bool_)
-    if time_step.gone is not None:
-        if not team:
-            problems.append(f"{where}: gone is for teams: leave it None, or set agents")
-        problems += _array(f"{where}: gone", time_step.gone, team, np.bool_)
+    for name in ("active", "gone"):
+        said = getattr(time_step, name)
+        if said is not None:
+            if not team:
+                problems.append(f"{where}: {name} is for teams: leave it None, or set agents")
+            problems += _array(f"{where}: {name}", said, team, np.bool_)
     return problems
 
 

@@ -98,6 +98,7 @@ class ExtendedTMaze(AbstractEnvironment):
 
     obs_size: ClassVar[int] = 3
     action_size: ClassVar[int] = 1
+    reported: ClassVar[str] = "score"
 
     depth: int = eqx.field(static=True, default=2)  # junctions on the way, 1..24
     robots: int = eqx.field(static=True, default=1)  # robots that learn, at least 1
@@ -155,10 +156,6 @@ class ExtendedTMaze(AbstractEnvironment):
     @property
     def signals(self) -> tuple[str, ...]:
         return (*self.rewards, "shaped") if self.shaping else self.rewards
-
-    @property
-    def reported(self) -> str:
-        return "score"
 
     @property
     def obs_range(self) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import numpy as np
 
+from .. import require
 from . import names, processes, worker
 from .host import (
     AbstractCopies,
@@ -72,13 +73,10 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
                 f"kwargs is {self.kwargs!r}: it must be pairs (name, value) or a dict, and a value "
                 "a number, a string, a bool, None or a tuple of these, so that a run can record it"
             )
-        limit = self.max_episode_steps
-        if limit is not None and limit < 1:
-            raise ValueError(f"max_episode_steps is {limit}: it must be at least 1, or None")
+        require.at_least("max_episode_steps", self.max_episode_steps, 1)
+        require.at_least("at_once", self.at_once, 1)
         if not 0 <= self.tolerated <= 1:
             raise ValueError(f"tolerated is {self.tolerated}: it must be a share, from 0 to 1")
-        if self.at_once is not None and self.at_once < 1:
-            raise ValueError(f"at_once is {self.at_once}: it must be at least 1, or None")
         if not self.timeout > 0:
             raise ValueError(f"timeout is {self.timeout}: it must be more than 0 seconds")
 
@@ -86,6 +84,7 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
     action_size = _told("action_size")
     max_steps = _told("max_steps")
     obs_dtype = _told("obs_dtype")
+    agents = _told("agents")
     discrete = _told("discrete")
 
     def spec(self) -> dict[str, Any]:
@@ -316,7 +315,7 @@ class ForeignCopies(AbstractCopies):
     def _say(self, why: str) -> None:
         """The first, tenth, hundredth … failure, on the error stream."""
         if self._env.tolerated and math.log10(self._discarded).is_integer():
-            with contextlib.suppress(OSError, ValueError):  # nobody reads it
+            with contextlib.suppress(OSError, ValueError):  # it is not read any more
                 print(
                     f"credo: {self._discarded:,} episode{'s' * (self._discarded > 1)} failed and "
                     f"left out, now: {why}. The run ends if more than {self._env.tolerated:.0%} of "

@@ -21,7 +21,7 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import WrapperSpec
 
-OWN_TEAMS = ("pettingzoo.", "mpe2.")  # modules of teams that are nobody's own code
+OWN_TEAMS = ("pettingzoo.", "mpe2.")  # modules of teams that are no user's own code
 ALONE = "name the module, as in mine:{}, or set in_process=True"
 
 _HERE: dict[str, Any] = {}  # what no other process can import, by the name that it got here
@@ -164,7 +164,7 @@ def kind_of(name: str, kwargs: Mapping[str, Any] | None = None) -> str | None:
         if not isinstance(made, type) or made is inspect.Signature.empty:
             env = maker(**(kwargs or {}))
             made = type(env)
-            with contextlib.suppress(Exception):  # nobody needs it any more
+            with contextlib.suppress(Exception):  # it is not needed any more
                 env.close()
     bases = getattr(made, "__mro__", ())
     if gymnasium.Env in bases:

@@ -25,7 +25,7 @@ PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 LONGEST = 5.0  # seconds that a guardian gets to kill what it guards
 MULTIPLYING = "put it under if __name__ == '__main__'"
 
-_worker = False  # whether this process is somebody's child, started here
+_worker = False  # whether this process is a child, started here
 _forked = False  # whether it was forked from one in which JAX has threads
 
 
@@ -218,7 +218,7 @@ def _kill_all(worker: int) -> None:
         os.killpg(worker, signal.SIGKILL)
     children = pathlib.Path(f"/proc/self/task/{os.getpid()}/children")
     while children.exists():
-        # Whose parent is killed comes here, so that in the end nobody is left.
+        # Whose parent is killed comes here, so that in the end none is left.
         left = children.read_text().split()
         for pid in left:
             with contextlib.suppress(OSError):

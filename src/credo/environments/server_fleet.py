@@ -95,7 +95,7 @@ class ServerFleet(AbstractEnvironment):
     than 0. Raw counts drown the worth: 20 devices with 5 requests each against one ±1."""
     schedule: tuple[tuple[int, int], ...] | None = eqx.field(static=True, default=None)
     """One (joins, leaves) per server: it is away before step `joins` and from step `leaves` on,
-    counted from 0. None: nobody is ever away."""
+    counted from 0. None: no server is ever away."""
     classes: tuple[bool, ...] | None = eqx.field(static=True, default=None)
     """Whether each device is genuine, the same in every episode; None: drawn by `nefarious`."""
 

@@ -49,6 +49,7 @@ class SimpleSpread(AbstractEnvironment):
     """
 
     signals: ClassVar[tuple[str, ...]] = ("global", "local")
+    reported: ClassVar[str] = "global"
     action_size: ClassVar[int] = 2
 
     agents: int = eqx.field(static=True, default=3)  # agents and landmarks, at least 2 of each
@@ -60,10 +61,6 @@ class SimpleSpread(AbstractEnvironment):
         require.at_least("agents", self.agents, 2)
         require.at_least("max_steps", self.max_steps, 1)
         require.within("local_ratio", self.local_ratio, 0.0, 1.0)
-
-    @property
-    def reported(self) -> str:
-        return "global"
 
     @property
     def obs_size(self) -> int:

@@ -115,7 +115,7 @@ class Environments:
     """
 
     def __init__(self, spec: dict[str, Any], n: int, current: Any = None):
-        self._alone = current is not None  # nobody's Ctrl-C is meant for this process
+        self._alone = current is not None  # Ctrl-C is not meant for this process
         self.current = [0, 0] if current is None else current
         self.n, self._spec, self._envs = n, spec, []
         self._kind = APIS[spec.get("api", "gymnasium")]
@@ -230,7 +230,7 @@ class Environments:
 
     def close(self, grace: float = 0.0) -> None:
         while self._envs:
-            with contextlib.suppress(Exception):  # nobody needs it any more
+            with contextlib.suppress(Exception):  # it is not needed any more
                 self._envs.pop().close()
 
 
@@ -346,7 +346,7 @@ class Process:
         view = memoryview(into)
         while got < least:
             if self._in not in self._wait(self._readable):
-                raise self._ended()  # though somebody it started may hold the pipe open
+                raise self._ended()  # though a process it started may hold the pipe open
             count = os.readv(self._in, [view[got:]])
             if count == 0:
                 raise self._ended()

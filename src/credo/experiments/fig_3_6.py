@@ -28,7 +28,7 @@ def writes_on(signals: Sequence[float]) -> Callable[[Trained], Iterator[Row | Se
         best, steps = int(lengths(trained).argmax()), np.arange(1, len(inputs) + 1)
         yield Row(labels, None, "best run", best)
         yield from series("input", "step", steps, np.asarray(inputs[:, 0], int), labels)
-        found = [memory.write_magnitudes(run.champion, inputs) for run in trained.runs]
+        found = [jnp.abs(memory.writes(run.champion, inputs)) for run in trained.runs]
         cells = rounded(found[best], 3).T[None]
         axes: dict[str, Any] = {"seed": [trained.seeds[best]], "cell": names(len(cells[0]))}
         yield from series("write", "step", steps, cells, labels, **axes)

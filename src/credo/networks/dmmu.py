@@ -188,12 +188,12 @@ class DMMUPolicy(AbstractPolicy):
     def without(self, agents: Sequence[int]) -> "DMMUPolicy":
         """The team that is left when those at these indices go, in the same order.
 
-        Also of a population. ValueError if there is no such agent, or nobody would be left.
+        Also of a population. ValueError if there is no such agent, or none would be left.
         """
         self._check(agents)
         left = [i for i in range(len(self.agents)) if i not in set(agents)]
         if not left:
-            raise ValueError(f"without agents {sorted(set(agents))} nobody is left: keep one")
+            raise ValueError(f"without agents {sorted(set(agents))} no agent is left: keep one")
         return self._of(left)
 
     def with_clones(self, agents: Sequence[int]) -> "DMMUPolicy":
