@@ -27,7 +27,7 @@ class TimeStep(eqx.Module):
     terminated: Bool[Array, ""]  # the task ended: do not bootstrap
     truncated: Bool[Array, ""]  # the clock ran out: do bootstrap
     active: Bool[Array, " agents"] | None = None
-    gone: Bool[Array, " agents"] | None = None  # None: nobody before the episode ends
+    gone: Bool[Array, " agents"] | None = None  # None: none before the episode ends
 
     @property
     def ended(self) -> Bool[Array, "*agents"]:

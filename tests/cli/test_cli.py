@@ -819,7 +819,7 @@ def test_a_task_of_ones_own_is_trained_and_resumed(credo, own_tasks, tmp_path, m
     for command in ("resume", "evaluate", "watch"):
         code, out, err = credo(f"{command} {path}")
         assert (code, out) == (1, "")
-        assert f"names {own_tasks}:Good, which is somebody's own code" in err
+        assert f"names {own_tasks}:Good, which is code of others" in err
         assert "--trust" in err
     assert credo(f"evaluate {path} --episodes 2 --trust")[0] == 0
     for command in ("report", "export"):  # they import nothing

@@ -64,7 +64,7 @@ def _named(name: str, kwargs: dict[str, Any]) -> Any:
 
 
 def _absent(name: str, id: str, registry: Any) -> None:
-    """Say what was meant by an id that nobody registered."""
+    """Say what was meant by an id that is not registered."""
     if package := CATALOGUE["packages"].get(id.partition("/")[0]):
         module = package.replace("-", "_")
         fail(f"{id} is a task of {package}: pip install {package}, then name it {module}:{id}")
@@ -119,7 +119,7 @@ def problems(env: Any) -> list[str]:
     """What `check_environment` finds; an exception of the task's own code is a problem too."""
     try:
         return checks.check_environment(env)
-    except Exception as error:  # the task is somebody else's code: say where, and what often helps
+    except Exception as error:  # the task is code of others: say where, and what often helps
         own = sys.modules[type(env).__module__].__file__
         frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == own]
         where = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""

@@ -30,7 +30,7 @@ def command(core: int) -> list[str]:
 
 
 def _end_with_parent(parent: int) -> None:
-    """Save and end when the parent is gone: nobody would read the answer. Whatever this process
+    """Save and end when the parent is gone: the answer would not be read. Whatever this process
     started goes with it."""
     while os.getppid() == parent:
         time.sleep(1.0)

@@ -128,7 +128,7 @@ class HeatMap:
 
 @dataclass(frozen=True)
 class Track:
-    """Somebody's row at each column of `Tracks`. `notes`: what the table adds at each column."""
+    """One row at each column of `Tracks`. `notes`: what the table adds at each column."""
 
     label: str
     rows: Sequence[int]
@@ -169,7 +169,7 @@ class Tracks:
         for place in every[1:]:
             if not all(0 <= row < rows for row in place):
                 raise ValueError(
-                    f"tracks {self.title!r} have {rows} row labels and somebody or a goal in rows "
+                    f"tracks {self.title!r} have {rows} row labels and a mark or a goal in rows "
                     f"{list(place)}: each must be in 0..{rows - 1}"
                 )
 
