@@ -93,6 +93,8 @@ SEQUENCE_MARKS = (
 
 
 class SequenceState(eqx.Module):
+    """A sequence between two steps."""
+
     sequence: Sequence
     step: Int[Array, ""]
     perfect: Bool[Array, ""]  # every scored answer so far was right

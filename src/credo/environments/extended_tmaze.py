@@ -143,10 +143,12 @@ class ExtendedTMaze(AbstractEnvironment):
 
     @property
     def endpoints(self) -> int:
+        """Where the paths end, numbered from 0."""
         return 2**self.depth
 
     @property
     def trials(self) -> int:
+        """Walks from the start to an endpoint in one episode."""
         return 3 * self.endpoints
 
     @property
@@ -282,6 +284,7 @@ class ExtendedTMaze(AbstractEnvironment):
         return shown
 
     def _goals(self, key: PRNGKeyArray) -> Int[Array, " 3"]:
+        """Endpoints of the reward in the three thirds of the trials."""
         n = self.endpoints
         first_key, *move_keys = jax.random.split(key, 3)
         goals = [jax.random.randint(first_key, (), 0, n)]
@@ -299,6 +302,7 @@ class ExtendedTMaze(AbstractEnvironment):
         return self.corridor[0] if state.lengths is None else state.lengths[junction]
 
     def _company(self, everybody: Int[Array, " team"]) -> Bool[Array, " robots"]:
+        """Which robots are told that they were not alone at their endpoint."""
         if self.presence == "as-coded":
             return jnp.broadcast_to(jnp.all(everybody == everybody[0]), self.robots)
         same = everybody[: self.robots, None] == everybody[None]
@@ -342,6 +346,7 @@ class ExtendedTMaze(AbstractEnvironment):
         there: Bool[Array, " robots"],
         arrived: Bool[Array, ""],
     ) -> Int[Array, "robots endpoints"] | None:
+        """The last visits to each endpoint, after this step; None without `shaping`."""
         if state.visited is None:
             return None
         here = endpoint[:, None] == jnp.arange(self.endpoints)[None]

@@ -35,6 +35,7 @@ def _pairs(kwargs: Any) -> Any:
 
 
 def _plain(value: Any) -> bool:
+    """Whether JSON and a hash can hold it."""
     if isinstance(value, tuple):
         return all(_plain(item) for item in value)
     return value is None or isinstance(value, str | int | float)
@@ -159,6 +160,7 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
         return tuple(self._sizes()["warnings"])
 
     def _warn(self) -> None:
+        """Warn of what users should know, once for each task and process."""
         if self not in _WARNED:
             _WARNED.add(self)
             for told in self.warnings:
@@ -190,6 +192,9 @@ class ForeignCopies(AbstractCopies):
         _ALL.add(self)
 
     def _opened(self) -> worker.Environments | worker.Process:
+        """The worker that plays the copies, started where there is none.
+
+        **Raises:** `UnfitEnvironment` if the environment cannot be opened as this task."""
         if self._backend is None:
             env, spec = self._env, self._env.spec()
             processes.allow()
@@ -211,6 +216,7 @@ class ForeignCopies(AbstractCopies):
 
     @property
     def usable(self) -> bool:
+        """Whether these copies can be reset: not closed, and no call was interrupted."""
         return not self._closed and (self._backend is None or self._backend.usable)
 
     @property
@@ -219,6 +225,7 @@ class ForeignCopies(AbstractCopies):
         return sum(map(bool, self._recent))
 
     def failure_text(self, i: int) -> str:
+        """What went wrong, in which copy, at which step, with which seed, and what to do."""
         return self._whys.get(i, "unknown")
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
@@ -340,6 +347,7 @@ class ForeignCopies(AbstractCopies):
 
 
 def _form(x: np.ndarray, shape: tuple[int, ...], dtype: type) -> np.ndarray:
+    """An array of this dtype; `ValueError` if its shape is another one."""
     x = np.asarray(x, dtype)
     if x.shape != shape:
         raise ValueError(f"an array of shape {x.shape} was given: it must be {shape}")

@@ -118,6 +118,7 @@ class InTurn(AbstractCopies):
         return now
 
     def failure_text(self, i: int) -> str:
+        """By the number of the copy, not of its seat."""
         return self._whys.get(i, "unknown")
 
     def _some(self, x: np.ndarray) -> np.ndarray:
@@ -127,11 +128,13 @@ class InTurn(AbstractCopies):
         return some
 
     def _all(self, x: np.ndarray) -> np.ndarray:
+        """What those who play say, in rows of all copies; the others have zeros."""
         rows = np.zeros((self.n, *x.shape[1:]), x.dtype)
         rows[self._seats] = x[: self._seats.size]
         return rows
 
     def _keep(self, failed: np.ndarray | None) -> None:
+        """Remember why copies failed, by their own numbers."""
         for seat, lane in enumerate(self._seats.tolist()):
             if failed is not None and failed[lane]:
                 self._whys[lane] = self.inner.failure_text(seat)
@@ -247,6 +250,7 @@ class Episodes:
         return jax.tree.map(kept, *self._rows)
 
     def returns(self) -> dict[str, Float[np.ndarray, "n *agents"]]:
+        """Sum of every reward in each episode; NaN of one that is lost."""
         for total in self._sums.values():
             total[self._lost] = np.nan
         return self._sums

@@ -70,6 +70,7 @@ def here_alone(name: str) -> bool:
 
 
 def _nameable(thing: Any) -> bool:
+    """Whether it is a class or a plain Python function."""
     return isinstance(thing, type) or inspect.isfunction(thing)
 
 
@@ -197,6 +198,7 @@ def foreign_code(api: str, id: str, kwargs: Mapping[str, Any]) -> str | None:
 
 
 def _own(spec: Any) -> bool:
+    """Whether entry point and wrappers of a registered environment are Gymnasium's or Credo's."""
     entries = [spec.entry_point, *(w.entry_point for w in spec.additional_wrappers)]
     modules = [x if isinstance(x, str) else getattr(x, "__module__", "") for x in entries]
     return all(module.startswith(("gymnasium.", "credo.")) for module in modules)
@@ -238,6 +240,7 @@ def register(told: dict[str, Any] | None) -> None:
 
 
 def _json(value: Any) -> bool:
+    """Whether JSON can hold it."""
     try:
         json.dumps(value)
     except (TypeError, ValueError):

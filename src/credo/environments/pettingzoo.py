@@ -185,6 +185,7 @@ class ParallelTeam(ParallelEnv):
         return np.asarray(env.render(self._state))
 
     def _infos(self) -> dict[str, dict[str, Any]]:
+        """All rewards of each agent, and whether it acts at the next step."""
         n = len(self.possible_agents)
         rewards = {
             name: np.broadcast_to(np.asarray(reward), n).tolist()
@@ -199,6 +200,7 @@ class ParallelTeam(ParallelEnv):
         return self._by_agent(infos)
 
     def _by_agent(self, rows: Any) -> dict[str, Any]:
+        """One of the rows for each agent."""
         return dict(zip(self.possible_agents, rows, strict=True))
 
 

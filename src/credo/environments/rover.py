@@ -366,6 +366,7 @@ class Rover(AbstractEnvironment):
         return position, drawn[jnp.arange(self.pois), chosen]
 
     def _move(self, state: RoverState, action: Float[Array, "rovers 2"]):
+        """Positions (m), headings (rad) and speeds (m per step) after clipped actions."""
         if self.motion == "as-coded":
             heading = state.heading + 0.5 * math.pi * action[:, 1]
             speed = jnp.full(self.agents, CODED_SPEED)
@@ -439,6 +440,8 @@ class Rover(AbstractEnvironment):
     def _pay(
         self, state: RoverState, local: Float[Array, " rovers"], ended: Bool[Array, ""]
     ) -> dict[str, Array]:
+        """The named rewards of a step: `local` in every step, the others once the episode has
+        `ended`."""
         share = self._share(state.observed, state.nearness)
         rewards = {"local": local, "global": jnp.where(ended, share, 0.0)}
         if "mixed" in self.rewards:
@@ -453,6 +456,7 @@ class Rover(AbstractEnvironment):
         return {name: rewards[name] for name in self.rewards}
 
     def _share(self, observed: Bool[Array, "*rovers pois"], nearness) -> Float[Array, "*rovers"]:
+        """Share of the POIs' value that is observed, or of what `nearness` pays for the others."""
         paid = observed.astype(jnp.float32)
         if nearness is not None:
             paid = jnp.maximum(paid, nearness)
@@ -579,6 +583,7 @@ def _coded_places(rovers: int, pois: int, size, rover_key: PRNGKeyArray, poi_key
 
 
 def _check_rewards(env: Rover) -> None:
+    """Raise `ValueError` unless each reward is known, named once, and defined for these options."""
     if not env.rewards or len(set(env.rewards)) < len(env.rewards):
         raise ValueError(f"rewards is {env.rewards}: name at least one, and each only once")
     for name in env.rewards:
@@ -591,6 +596,7 @@ def _check_rewards(env: Rover) -> None:
 
 
 def _check_pois(env: Rover) -> None:
+    """Raise `ValueError` unless values and places are as many as POIs and rovers."""
     if env.poi_values is not None:
         if len(env.poi_values) != env.pois:
             raise ValueError(

@@ -40,6 +40,8 @@ ACTS, BUSY, AWAY = 1.0, 0.0, -1.0  # a server's status, as observed
 
 
 class FleetState(eqx.Module):
+    """A fleet between two steps."""
+
     genuine: Bool[Array, " devices"]
     pending: Int[Array, " devices"]  # requests not served yet, at least 0
     told: Float[Array, "servers devices"]  # ±1 where a server was last told what it had served
@@ -133,6 +135,7 @@ class ServerFleet(AbstractEnvironment):
         self._check_schedule()
 
     def _check_schedule(self):
+        """Raise `ValueError` unless every server has times to join and leave, in this order."""
         if self.schedule is None:
             return
         if not isinstance(self.schedule, Sequence):
@@ -243,12 +246,14 @@ class ServerFleet(AbstractEnvironment):
         return (joins <= step) & (step < leaves)
 
     def _busy_steps(self, *, key: PRNGKeyArray) -> Int[Array, " servers"]:
+        """For how many steps each server would be busy after acting now."""
         low, high = span(self.busy)
         if low == high:
             return jnp.full(self.servers, low, jnp.int32)
         return jax.random.randint(key, (self.servers,), low, high + 1)
 
     def _time_step(self, state: FleetState, net: Float[Array, ""]) -> TimeStep:
+        """What servers observe of a state, and `net` for the step that led to it."""
         present = self.present(state.step)
         active = present & (state.busy == 0)
         counts, worth = self.scale

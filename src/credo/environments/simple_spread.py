@@ -96,6 +96,7 @@ class SimpleSpread(AbstractEnvironment):
         return way, jnp.sqrt(jnp.sum(way**2, axis=-1))
 
     def _earned(self, state: SpreadState) -> Float[Array, " agents"]:
+        """mpe2's reward of each agent: collisions and uncovered landmarks."""
         _, distance = self._apart(state.position)
         hits = jnp.sum((distance < REACH).astype(jnp.float32), axis=1) - 1.0  # not with itself
         way = state.landmarks[:, None] - state.position[None]
@@ -110,6 +111,7 @@ class SimpleSpread(AbstractEnvironment):
         return TimeStep(self._observe(state), rewards, jnp.bool_(False), truncated, everyone)
 
     def _observe(self, state: SpreadState) -> Float[Array, "agents obs"]:
+        """Velocity, position, and the ways to landmarks and other agents, one row an agent."""
         n, here = self.agents, state.position
         others = np.array([[k for k in range(n) if k != i] for i in range(n)])
         parts = [

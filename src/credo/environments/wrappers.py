@@ -225,6 +225,8 @@ class DelayedHostReward(AbstractHostEnvironment):
 
 
 class DelayedCopies(AbstractCopies):
+    """Copies whose rewards are paid at the last step of each episode."""
+
     def __init__(self, inner: AbstractCopies, shapes: dict[str, tuple[int, ...]]):
         self.inner, self.n = inner, inner.n
         self._earned = {name: np.zeros((inner.n, *shape)) for name, shape in shapes.items()}
