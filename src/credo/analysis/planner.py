@@ -35,6 +35,7 @@ class StraightLines(AbstractPolicy):
 
     agents: int = eqx.field(static=True)
     coded: bool = eqx.field(static=True, default=False)  # the motion is "as-coded"
+    drive: float = 1.0  # share of the full speed, in [0, 1]
 
     def start(self, *, key: PRNGKeyArray) -> Float[Array, " agents"]:
         """The turn in radians that is left to make."""
@@ -42,7 +43,7 @@ class StraightLines(AbstractPolicy):
 
     def __call__(self, obs: Float[Array, "agents obs"], carry: Float[Array, " agents"]):
         made = _possible(carry, self.coded)
-        return _action(made, jnp.ones(self.agents), self.coded), carry - made
+        return _action(made, jnp.full(self.agents, self.drive), self.coded), carry - made
 
 
 class GreedyTeam(AbstractPolicy):

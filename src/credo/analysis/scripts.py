@@ -21,13 +21,15 @@ class RandomTeam(AbstractPolicy):
 
     agents: int = eqx.field(static=True)
     size: int = eqx.field(static=True)  # of an action
+    amplitude: float = 1.0  # the largest action, in [0, 1]; an array once it is one of a population
 
     def start(self, *, key: PRNGKeyArray) -> PRNGKeyArray:
         return key
 
     def __call__(self, obs: Float[Array, "agents obs"], carry: PRNGKeyArray):
         carry, key = jax.random.split(carry)
-        return jax.random.uniform(key, (self.agents, self.size), minval=-1.0, maxval=1.0), carry
+        drawn = jax.random.uniform(key, (self.agents, self.size), minval=-1.0, maxval=1.0)
+        return self.amplitude * drawn, carry
 
 
 def random_team(env: Any) -> RandomTeam:

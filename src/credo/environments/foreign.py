@@ -41,7 +41,7 @@ def _plain(value: Any) -> bool:
     return value is None or isinstance(value, str | int | float)
 
 
-def _told(name: str) -> Any:
+def _size(name: str) -> Any:
     """A property that only the environment itself can tell."""
     return property(lambda self: self._sizes()[name])
 
@@ -81,12 +81,12 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
         if not self.timeout > 0:
             raise ValueError(f"timeout is {self.timeout}: it must be more than 0 seconds")
 
-    obs_size = _told("obs_size")
-    action_size = _told("action_size")
-    max_steps = _told("max_steps")
-    obs_dtype = _told("obs_dtype")
-    agents = _told("agents")
-    discrete = _told("discrete")
+    obs_size = _size("obs_size")
+    action_size = _size("action_size")
+    max_steps = _size("max_steps")
+    obs_dtype = _size("obs_dtype")
+    agents = _size("agents")
+    discrete = _size("discrete")
 
     def spec(self) -> dict[str, Any]:
         """What a worker must know to open it, as JSON has it."""

@@ -227,16 +227,12 @@ class DelayedHostReward(AbstractHostEnvironment):
 class DelayedCopies(AbstractCopies):
     """Copies whose rewards are paid at the last step of each episode."""
 
+    failed = _of("inner", "failed")
+    failure_text = _of("inner", "failure_text")
+
     def __init__(self, inner: AbstractCopies, shapes: dict[str, tuple[int, ...]]):
         self.inner, self.n = inner, inner.n
         self._earned = {name: np.zeros((inner.n, *shape)) for name, shape in shapes.items()}
-
-    @property
-    def failed(self) -> np.ndarray | None:
-        return self.inner.failed
-
-    def failure_text(self, i: int) -> str:
-        return self.inner.failure_text(i)
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
         for earned in self._earned.values():
