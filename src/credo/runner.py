@@ -206,7 +206,7 @@ class Units:
         strangers = [name for name in observation if name not in (self.names or ())]
         if strangers or self.names is None:
             raise ValueError(
-                f"the observation names {strangers[:1] or 'no agents'}: this team has "
+                f"the observation names {strangers[:1] or 'no agent'}: this team has "
                 f"{self.names or 'no names, so give a row for each agent'}"
             )
         return [observation.get(name) for name in self.names]

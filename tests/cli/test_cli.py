@@ -391,7 +391,8 @@ def test_evaluate_plays_fresh_episodes_of_any_depth(credo, run):
         "accuracy",
         "success",
         "steps",
-        "floor",
+        "baseline",
+        "upper",
     ]
     assert 3 <= float(lines[4].split()[1]) <= 4  # depth 2, a gap of 1 or 2
     assert credo(f"evaluate {run} --episodes 40")[1] == out
@@ -831,7 +832,7 @@ def test_a_task_of_ones_own_is_trained_and_resumed(credo, own_tasks, tmp_path, m
     for command in ("resume", "evaluate", "watch"):
         code, out, err = credo(f"{command} {path}")
         assert (code, out) == (1, "")
-        assert f"names {own_tasks}:Good, which is somebody's own code" in err
+        assert f"names {own_tasks}:Good, which is code of others" in err
         assert "--trust" in err
     assert credo(f"evaluate {path} --episodes 2 --trust")[0] == 0
     for command in ("report", "export"):  # they import nothing

@@ -222,12 +222,12 @@ def test_a_champion_is_described_by_every_signal_of_its_task(run):
     lines = evaluation.describe(run, TASK, 50, 0)[0]
     assert lines[0] == f"{run.path}: 50 fresh episodes, mean ± standard error over episodes"
     names = [line.split()[0] for line in lines[1:]]
-    assert names == [*TASK.signals, "steps", "floor"]
+    assert names == [*TASK.signals, "steps", "baseline", "upper"]
     success = float(lines[3].split()[1])
     assert 50 * success == pytest.approx(round(50 * success))
     assert lines == evaluation.describe(run, TASK, 50, 0)[0]
-    assert "floor            0.75 (" in lines[-1]
-    assert lines[-1].endswith("ceiling 1")
+    assert "baseline         0.75 (" in lines[-2]
+    assert lines[-1] == "  upper bound      1"
 
 
 def test_one_episode_has_no_standard_error(run):

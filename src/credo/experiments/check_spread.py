@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import tree
 from ..algorithms.off_policy import OffPolicy
-from ..analysis import planner
+from ..analysis import scripts
 from ..environments.simple_spread import SimpleSpread
 from ..networks.exploration import GaussianNoise
 from ..networks.mlp import Critic
@@ -56,7 +56,7 @@ def build(method: str) -> OffPolicy:
 @functools.cache
 def random(env: SimpleSpread) -> dict[str, float]:
     """Mean return of actions drawn uniformly."""
-    team = tree.stack(planner.RandomTeam(env.agents))
+    team = tree.stack(scripts.random_team(env))
     played = measures.returns(env, team, EPISODES, measures.BASELINE_KEY)
     return {"random": round(float(np.mean(played)), 2)}
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import tree
 from ..algorithms.neuroevolution import Neuroevolution
-from ..analysis import fleet
+from ..analysis import bounds, fleet
 from ..environments.server_fleet import ServerFleet
 from ..environments.wrappers import NoisyObservations
 from ..evolution.breeder import altered
@@ -107,20 +107,20 @@ def clear(env: ServerFleet | NoisyObservations) -> ServerFleet:
 
 
 @cache
-def _references(env: ServerFleet) -> dict[str, tuple[float, float]]:
-    return fleet.floors_and_ceilings(env, 1000, key=jax.random.key(21_000))
+def _references(env: ServerFleet) -> dict[str, float]:
+    return bounds.baselines(env) | {"oracle": bounds.upper_bound(env).value}
 
 
 def references(trained: Trained) -> list[Row]:
     """Mean net requests of baselines, of a script that discovers, and of an oracle."""
     return [
         trained.fact("reference", round(value, 2), policy=name)
-        for name, (value, _) in _references(clear(trained.env)).items()
+        for name, value in _references(clear(trained.env)).items()
     ]
 
 
-def nobody_writes(trained: Trained) -> list[Row]:
-    """Net requests of DMMUs while nobody writes."""
+def without_writing(trained: Trained) -> list[Row]:
+    """Net requests of DMMUs whose agents do not write."""
     teams = [run.champion for run in trained.runs]
     if not all(isinstance(team, DMMUPolicy) and team.config.cell == "mmu" for team in teams):
         return []
@@ -150,19 +150,19 @@ SCORES = Table(
         "published": published(METRIC),
         "measured": mean(METRIC, 1, 1),
         "median (range)": median(METRIC),
-        "median (range) while nobody writes": median(f"{METRIC} while nobody writes"),
+        "median (range) without writing": median(f"{METRIC} while nobody writes"),
         "a script that discovers": known("reference", policy="discovering"),
         "an oracle": known("reference", policy="oracle"),
     },
     caption=f"Measured: {EPISODES} fresh episodes. Published: mean ± standard error. The script "
     "shares what it finds at once: a lower bound on what discovering can reach. The oracle knows "
-    "the classes. While nobody writes a DMMU has no memory, neither of others nor of its own, but "
+    "the classes. Without writing a DMMU has no memory, neither of others nor of its own, but "
     "the last output.",
 )
 MEASURES = (
     references,
     final(METRIC, EPISODES, 3, each=False, reward="net"),
     smoothed(METRIC, 2),
-    nobody_writes,
+    without_writing,
 )
 EXPERIMENTS = {"fig-4.7": Experiment(cells, MEASURES, (SCORES, CURVES), BUDGETS)}

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..analysis import floors
+from ..analysis import bounds
 from ..analysis.generalization import first_mistakes, success_with_gap
 from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
@@ -82,7 +82,7 @@ def of_gaps(axis: tuple[str, str], what: str, first: int, **levels: float) -> tu
 
 def baselines(results: Results, values: Sequence[Value]) -> list[page.Section]:
     """Exact success without counting, at the depths of the table."""
-    found = [100 * max(floors.classification_floors(depth).values()) for depth in SHOWN]
+    found = [100 * bounds.best_baseline(SequenceClassification(x))[1] for x in SHOWN]
     title = "Baseline: the best policy that keeps at most one signal, %"
     return [page.Table(title, [f"at {x}" for x in SHOWN], [[f"{x:.1f}" for x in found]])]
 

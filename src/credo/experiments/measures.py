@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 
 from .. import tree
 from ..algorithms.lineage import MAKERS
-from ..analysis import attribution, planner, statistics
+from ..analysis import attribution, bounds, statistics
 from ..environments.gymnasium import close_all
 from ..environments.rover import Rover
 from ..environments.wrappers import DelayedHostReward
@@ -181,5 +181,5 @@ def rover_baselines(env: Rover) -> dict[str, float]:
 
 @functools.cache
 def _rover_baselines(env: Rover) -> dict[str, float]:
-    found = planner.floors_and_ceilings(env, 50, key=jax.random.key(BASELINE_KEY))
-    return {name: round(float(np.mean([row[name] for row in found])), 3) for name in found[0]}
+    found = bounds.baselines(env) | {"bound": bounds.upper_bound(env).value}
+    return {name: round(value, 3) for name, value in found.items()}

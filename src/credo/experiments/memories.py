@@ -140,7 +140,7 @@ def writes_on(signals: Sequence[float]) -> Callable[[Trained], Iterator[Row | Se
         best, at = int(lengths(trained).argmax()), ("step", np.arange(1, len(inputs) + 1))
         yield trained.fact("best run", best)
         yield from series("input", *at, np.asarray(inputs[:, 0], int), trained.labels)
-        found = [memory.write_magnitudes(run.champion, inputs) for run in trained.runs]
+        found = [jnp.abs(memory.writes(run.champion, inputs)) for run in trained.runs]
         cells, one = found[best].T, trained.part(trained.seeds[best])
         yield from one.series("write", at, [cells], 3, cell=names(len(cells)))
         share = [memory.share_at_signals(x, inputs) for x in found]

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..algorithms.bptt import BPTT
 from ..algorithms.neuroevolution import Neuroevolution
-from ..analysis import floors, statistics
+from ..analysis import bounds, statistics
 from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
 from ..networks.mmu import MMU
@@ -121,7 +121,7 @@ def success(trained: Trained) -> list[Row]:
 
 def baseline(trained: Trained) -> list[Row]:
     """The best of three policies that keep at most one signal (the first, the last, none)."""
-    policy, value = floors.floor(trained.env)
+    policy, value = bounds.best_baseline(trained.env)
     return [trained.fact("baseline success", round(value, 4), policy=policy)]
 
 

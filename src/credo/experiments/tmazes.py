@@ -10,7 +10,7 @@ import numpy as np
 
 from ..algorithms.ccea import CCEA
 from ..algorithms.neuroevolution import author_mutation
-from ..analysis import maze_trace, statistics, tmaze
+from ..analysis import bounds, maze_trace, statistics, tmaze
 from ..environments.extended_tmaze import ExtendedTMaze
 from ..evolution.breeder import altered
 from ..evolution.islands import Islands
@@ -130,12 +130,8 @@ def smoothed(metric: str, digits: int) -> Measure:
 
 
 def levels(trained: Trained) -> list[Row]:
-    """Exact shares of policies that take no learning, and what no policy can pass."""
-    env = trained.env
-    # Every endpoint is as likely as any other; without memory there are the first and the last.
-    team = {"one at each end": min(2, env.robots) / env.endpoints}
-    known = tmaze.floors(env) if env.robots == 1 else team
-    kind, bound = tmaze.ceiling(env)
+    """Exact shares of policies that take no learning, and their upper bound."""
+    known, (bound, kind) = bounds.baselines(trained.env), bounds.upper_bound(trained.env)
     baselines = [trained.fact("baseline", round(known[k], 4), policy=k) for k in known]
     return [*baselines, trained.fact("upper bound", round(bound, 4), kind=kind)]
 

@@ -13,10 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..algorithms.lineage import MAKERS
-from ..analysis import attribution, floors
-from ..environments.base import AbstractSequenceTask
-from ..environments.sequence_classification import SequenceClassification
-from ..environments.sequence_recall import SequenceRecall
+from ..analysis import attribution, bounds
 from ..learners.base import AbstractLearner
 from ..runs import config
 from ..runs.record import RunError
@@ -216,7 +213,7 @@ def _figure(runs: Groups, metric: str, title: str) -> Figure:
     unit = "frames" if all(budget.get("frames") for budget in budgets) else "generation"
     curves = [_curve(label, group, metric, unit) for label, group in runs.items()]
     scores = metric == "champion_score"
-    levels = dict.fromkeys(x for group in runs.values() if scores for x in _bounds(group))
+    levels = dict.fromkeys(x for group in runs.values() if scores for x in _bounds(group) or ())
     names = {"champion_score": "success" if levels else "return", "fitness_max": "fitness"}
     return Figure(title, unit, names.get(metric, metric), curves, tuple(levels))
 
@@ -237,17 +234,18 @@ def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
     return Curve(label, grid, [attribution.on_grid(c[unit], c[metric], grid) for c in columns])
 
 
-def _bounds(group: list[Run]) -> list[Reference]:
-    """The best trivial policy and the upper bound of the task, where Credo knows them. No other
-    task is made: that might run somebody's code."""
+def _bounds(group: list[Run]) -> tuple[Reference, Reference] | None:
+    """The best baseline and the upper bound of a run's task, where they are known exactly. No
+    other task is made: that might run code of others."""
     recorded = group[0].config["algorithm"]["env"]
-    if recorded["class"] not in map(config.class_name, (SequenceClassification, SequenceRecall)):
-        return []
-    task: AbstractSequenceTask = config.from_tree(recorded)
-    if not floors.known(task):
-        return []
-    name, value = floors.floor(task)
-    return [Reference(f"baseline: {name}", value), Reference("upper bound", floors.CEILING)]
+    if recorded["class"] not in map(config.class_name, bounds.EXACT):
+        return None
+    task = config.from_tree(recorded)
+    if not bounds.exact(task):
+        return None
+    name, value = bounds.best_baseline(task)
+    highest = bounds.upper_bound(task).value
+    return Reference(f"baseline: {name}", value), Reference("upper bound", highest)
 
 
 def _table(runs: Groups) -> Table:
@@ -268,8 +266,8 @@ def _row(label: str, group: list[Run]) -> list[Cell]:
     they are not known), seeds, and the generations that all runs have."""
     scores = [float(run.metrics["champion_score"][-1]) for run in group]
     told: list[Cell] = [None, None]
-    if bounds := _bounds(group):
-        low, high = bounds
+    if limits := _bounds(group):
+        low, high = limits
         told = [f"{low.value:.3f} ({low.label.partition(': ')[2]})", high.value]
     last = min(int(run.metrics["generation"][-1]) for run in group)
     summary = Summary(scores, [run.config["seed"] for run in group])

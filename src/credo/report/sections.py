@@ -120,8 +120,8 @@ class HeatMap:
 
 @dataclass(frozen=True)
 class Track:
-    """Somebody's row at each column of `Tracks`. `notes`: what the table adds at each column, ""
-    where there is nothing to add; none at all if there is nothing anywhere."""
+    """A row at each column of `Tracks`. `notes`: what the table adds at each column, "" where there
+    is nothing to add; none at all if there is nothing anywhere."""
 
     label: str
     rows: Sequence[int]
@@ -162,7 +162,7 @@ class Tracks:
         for place in every[1:]:
             if not all(0 <= row < rows for row in place):
                 raise ValueError(
-                    f"tracks {self.title!r} have {rows} row labels and somebody or a goal in rows "
+                    f"tracks {self.title!r} have {rows} row labels and a mark or a goal in rows "
                     f"{list(place)}: each must be in 0..{rows - 1}"
                 )
 

@@ -84,7 +84,7 @@ def to_tree(value: Any) -> Any:
 def from_tree(tree: Any, *, trust: bool = True, source: str = "this record") -> Any:
     """The object that `to_tree` recorded.
 
-    **Arguments:** `trust`: whether classes and environments of somebody's own may be imported, as
+    **Arguments:** `trust`: whether classes and environments of others may be imported, as
     in a record of this user. Without it a record that names any is refused before that.
     `source`: whose record it is, for messages.
 
@@ -116,7 +116,7 @@ def from_tree(tree: Any, *, trust: bool = True, source: str = "this record") -> 
 def _untrusted(source: str, named: str) -> str:
     """Why a record is not read, and what to do."""
     return (
-        f"{source} was not made here and names {named}, which is somebody's own code: look into "
+        f"{source} was not made here and names {named}, which is code of others: look into "
         "config.json, then give --trust (from Python Run(path, trust=True))"
     )
 

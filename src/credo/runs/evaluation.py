@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from .. import tree
-from ..analysis import counting, floors
+from ..analysis import bounds, counting
 from ..compilation import float32
 from ..environments.host import AbstractHostEnvironment
 from ..environments.sequence_classification import SequenceClassification
@@ -106,9 +106,10 @@ def _lines(run: Run, task: Any, result: Result) -> Iterator[str]:
         for k, mean in enumerate(score.agents):
             yield f"    agent {k:<8} {mean:.4g}"
     yield f"  steps            {result.steps:.1f}"
-    if floors.known(task):
-        name, value = floors.floor(task)
-        yield f"  floor            {value:.3g} ({name}), ceiling {floors.CEILING:.3g}"
+    if bounds.exact(task):
+        name, value = bounds.best_baseline(task)
+        yield f"  baseline         {value:.3g} ({name})"
+        yield f"  upper bound      {bounds.upper_bound(task).value:.3g}"
 
 
 def summary(path: pathlib.Path, results: list[Result]) -> Iterator[str]:

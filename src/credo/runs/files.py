@@ -1,6 +1,6 @@
 """Files: written whole or not at all, through no link, and read without waiting.
 
-A folder of a run may come from somebody else, or be looked at by anybody while it is written. So
+A folder of a run may come from another user, or be looked at by others while it is written. So
 what stands under a name that is to be written is never followed or trusted: a draft is a new file,
 and what is appended to is a regular file. What is read is a regular file of a bounded size: a
 pipe would make its reader wait for ever, and a sparse file may be larger than the memory.
@@ -47,12 +47,12 @@ def _drafted(path: str | os.PathLike[str]) -> Iterator[tuple[Path, int]]:
     try:
         yield draft, descriptor
         if os.fstat(descriptor).st_nlink == 0:
-            raise OSError(errno.EBUSY, "somebody else writes it at the same time", str(path))
+            raise OSError(errno.EBUSY, "another process writes it at the same time", str(path))
         os.fsync(descriptor)
         os.replace(draft, path)
     except BaseException as error:
         with contextlib.suppress(OSError):  # the first error counts
-            if os.fstat(descriptor).st_nlink:  # or it would be somebody else's
+            if os.fstat(descriptor).st_nlink:  # or it would be another user's
                 remove(draft)
         if isinstance(error, OSError):
             raise named(error, path) from error

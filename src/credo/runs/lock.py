@@ -74,7 +74,7 @@ def is_lock(path: Path) -> bool:
 
 def _write(descriptor: int, content: str) -> None:
     # The name is only for others to read: on a full disk the lock holds without it, and a file
-    # with a second name may be somebody else's.
+    # with a second name may be another user's.
     with contextlib.suppress(OSError):
         if os.fstat(descriptor).st_nlink == 1:
             os.truncate(descriptor, 0)

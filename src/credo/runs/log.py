@@ -251,7 +251,7 @@ def _cut(path: pathlib.Path, generation: int, *, every: bool = True) -> bytes:
         files.remove(path)
         return text
     status = os.lstat(path)
-    # A link, or another name of the same file, would be somebody else's.
+    # A link, or another name of the same file, would be another user's.
     ours = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
     if not ours or status.st_size != len(text):
         files.write_whole(path, [text])

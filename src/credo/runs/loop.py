@@ -362,7 +362,7 @@ def _train(
 ) -> Run:
     """From `saved` to the end of the budget. The caller holds the lock."""
     training = _Training(run, algorithm, saved, options, heard)
-    del saved  # its state is donated: nobody may hold the old one
+    del saved  # its state is donated: the old one may not be held
     with Signals(quiet=not options.progress) as signals, training.bar:
         reason = training.go_on(signals)
     if reason == "signal":

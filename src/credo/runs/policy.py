@@ -69,7 +69,7 @@ class Policy:
 @float32()
 def champion(run: Any) -> PyTree:
     """The policy that a `Run` shows. Where its record tells the task's sizes
-    and its networks are Credo's own, no environment is opened, and nothing of somebody's own is
+    and its networks are Credo's own, no environment is opened, and no code of others is
     imported."""
     tree, network = run.config["algorithm"], run.part("network")
     if network is None or "task" not in run.config or not tree["class"].startswith("credo."):
@@ -104,7 +104,7 @@ def _units(run: Any) -> Units:
 
 def task_of(run: Any) -> Mapping[str, Any]:
     """What a run's record tells of its task. One of an older Credo tells nothing: a task of others
-    is opened then, and refused if it is somebody's own code and the run is not trusted."""
+    is opened then, and refused if it is code of others and the run is not trusted."""
     if "task" not in run.config:
         return task_record(run.algorithm.env)
     _units(run)

@@ -97,7 +97,7 @@ def _check(record: Record) -> None:
 
 
 def write(folder: pathlib.Path, record: dict[str, Any], *, sign: bool = True) -> None:
-    """Write config.json, with a checksum and, unless somebody else's record was changed, with this
+    """Write config.json, with a checksum and, unless a record of others was changed, with this
     user's signature."""
     said = {k: v for k, v in record.items() if k not in (trust.CHECKSUM, trust.SIGNATURE)}
     if sign and (signature := trust.sign(said)):

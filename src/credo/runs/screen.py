@@ -12,11 +12,11 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-GONE = (errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO)  # nobody will ever read again
+GONE = (errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO)  # it will never be read again
 
 
 class Stream:
-    """A text stream that is written to as long as somebody reads it, and never raises."""
+    """A text stream that is written to as long as it is read, and never raises."""
 
     def __init__(self, inner: Any):
         self._inner = inner  # None where the process was started without one
@@ -62,7 +62,7 @@ def calm() -> Iterator[None]:
     try:
         yield
     finally:
-        if sys.stdout is now[0]:  # or somebody else's, who will put back what was there
+        if sys.stdout is now[0]:  # or that of others, who will put back what was there
             sys.stdout = before[0]
         if sys.stderr is now[1]:
             sys.stderr = before[1]
@@ -86,7 +86,7 @@ def occupy() -> None:
 
 @contextlib.contextmanager
 def _unread(stream: Any) -> Iterator[None]:
-    """What is said to nobody goes to nobody from now on, also what is left in a buffer."""
+    """What is not read goes nowhere from now on, also what is left in a buffer."""
     try:
         yield
     except AttributeError:

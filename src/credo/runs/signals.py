@@ -30,7 +30,7 @@ class Signals:
     """Ctrl-C, SIGTERM and SIGHUP ask for an end after the generation; a second one stops at once.
 
     Python handles a signal between two steps of its own, which may never come: a program that
-    runs, a pipe that nobody writes to. So a thread hears of it too, and if the second one does not
+    runs, a pipe that is not written to. So a thread hears of it too, and if the second one does not
     stop the process in `GRACE` seconds, it ends it. A hang-up that is ignored (`nohup`) stays so.
 
     `end`: called before that, to end child processes.
@@ -74,7 +74,7 @@ class Signals:
         """In a thread: end the process if `GRACE` seconds after a second signal it is still
         there."""
         seen = 0
-        while data := os.read(read, 64):  # empty once nobody can write any more
+        while data := os.read(read, 64):  # empty once no process can write any more
             for number in data:
                 seen += number in self._before
                 if number in self._before and seen == 2 and not self._left.wait(GRACE):

@@ -32,7 +32,7 @@ class Run:
     """
 
     def __init__(self, path: str | pathlib.Path, *, trust: bool = False, best: bool = False):
-        """`trust`: whether classes and environments of somebody's own may be imported that a run
+        """`trust`: whether classes and environments of others may be imported that a run
         names which this user did not make. `best`: show the best policy wherever the champion is
         meant. Raises `RunError`."""
         self.path, self._shown = pathlib.Path(path), BEST if best else CHAMPION
@@ -48,7 +48,7 @@ class Run:
 
     def part(self, name: str) -> Any:
         """A field of the recorded algorithm as an object (its `env`, `network`, `learners`), made
-        of Credo's own classes; None if somebody's own code would have to be imported for it. It
+        of Credo's own classes; None if code of others would have to be imported for it. It
         opens no environment."""
         try:
             return config.from_tree(self.config["algorithm"].get(name), trust=False)

@@ -3,7 +3,8 @@ import itertools
 import numpy as np
 import pytest
 
-from credo.analysis import floors
+from credo.analysis import bounds
+from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
 
@@ -27,8 +28,8 @@ def enumerate_all(depth, ties):
 
 @pytest.mark.parametrize("ties", ["positive", "free"])
 @pytest.mark.parametrize("depth", [1, 2, 3, 6, 11])
-def test_classification_floors_equal_full_enumeration(depth, ties):
-    assert floors.classification_floors(depth, ties) == enumerate_all(depth, ties)
+def test_classification_baselines_equal_full_enumeration(depth, ties):
+    assert bounds.baselines(SequenceClassification(depth, ties=ties)) == enumerate_all(depth, ties)
 
 
 @pytest.mark.parametrize(
@@ -40,39 +41,50 @@ def test_classification_floors_equal_full_enumeration(depth, ties):
         (21, "free", 0.336, 0.002),
     ],
 )
-def test_classification_floors_at_known_depths(depth, ties, first, echo):
-    found = floors.classification_floors(depth, ties)
+def test_classification_baselines_at_known_depths(depth, ties, first, echo):
+    found = bounds.baselines(SequenceClassification(depth, ties=ties))
     assert found["remember the first signal"] == pytest.approx(first, abs=5.1e-4)
     assert found["echo the last signal"] == pytest.approx(echo, abs=5.1e-4)
 
 
-def test_deep_floors_fall_as_the_arcsine_law_says():
+def test_deep_baselines_fall_as_the_arcsine_law_says():
     # P(a walk of d steps never falls below 0) ~ sqrt(2 / (π d)).
-    found = floors.classification_floors(200)
+    found = bounds.baselines(SequenceClassification(200))
     assert found["constant"] == pytest.approx(np.sqrt(2 / (np.pi * 200)), rel=0.01)
 
 
-def test_recall_floors_equal_full_enumeration():
+def test_recall_baselines_equal_full_enumeration():
     depth = 6
     turns = np.array(list(itertools.product((-1, 1), repeat=depth)))
-    found = floors.recall_floors(depth)
+    found = bounds.baselines(SequenceRecall(depth))
     assert found["chance"] == found["repeat one direction"] == (turns == 1).all(axis=1).mean()
     assert found["repeat the first direction"] == (turns == turns[:, :1]).all(axis=1).mean()
 
 
-def test_floor_names_the_best_trivial_policy_under_the_tasks_rule():
-    assert floors.floor(SequenceClassification(depth=5)) == ("remember the first signal", 0.5)
+def test_the_best_baseline_under_the_tasks_rule():
+    assert bounds.best_baseline(SequenceClassification(depth=5)) == (
+        "remember the first signal",
+        0.5,
+    )
     free = SequenceClassification(depth=5, ties="free")
-    assert floors.floor(free) == ("remember the first signal", 0.625)
-    assert floors.floor(SequenceRecall(depth=3)) == ("repeat the first direction", 0.25)
+    assert bounds.best_baseline(free) == ("remember the first signal", 0.625)
+    assert bounds.best_baseline(SequenceRecall(depth=3)) == ("repeat the first direction", 0.25)
 
 
-def test_errors_name_what_is_allowed():
-    with pytest.raises(ValueError, match="depth is 0"):
-        floors.classification_floors(0)
-    with pytest.raises(ValueError, match="depth is 0"):
-        floors.recall_floors(0)
-    with pytest.raises(ValueError, match="'positive' or 'free'"):
-        floors.classification_floors(3, "half")  # pyright: ignore[reportArgumentType]
+def test_a_perfect_memory_is_the_upper_bound():
+    assert bounds.upper_bound(SequenceClassification(depth=5)) == (1.0, "optimal")
+    assert bounds.upper_bound(SequenceRecall(depth=3)) == (1.0, "optimal")
+
+
+def test_of_which_tasks_bounds_are_counted():
+    assert bounds.exact(SequenceClassification())
+    assert not bounds.exact(SequenceClassification(persistence=0.7))
+    assert bounds.exact(SequenceRecall())
+    assert not bounds.exact(Copy())
+
+
+def test_a_task_without_bounds_is_told():
+    with pytest.raises(TypeError, match="no baselines are known for Copy: give a Sequence"):
+        bounds.baselines(Copy())
     with pytest.raises(TypeError, match="int"):
-        floors.floor(3)  # pyright: ignore[reportArgumentType]
+        bounds.upper_bound(3)
