@@ -20,7 +20,7 @@ NEEDED, TOLERANCE = 6e9, 0.1
 
 
 def transitions(n: int) -> Transition:
-    """Rows of ones: pages that nobody writes would take no memory."""
+    """Rows of ones: pages that are not written would take no memory."""
     obs, action = np.ones((n, OBS), np.float32), np.ones((n, ACT), np.float32)
     rewards, ended = {"reward": np.ones(n, np.float32)}, np.ones(n, bool)
     return Transition(obs, action, rewards, obs, terminated=ended, truncated=ended)

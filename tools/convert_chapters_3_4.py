@@ -9,9 +9,9 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from credo.experiments.alg_3_3 import METRICS
 from credo.experiments.base import grid
-from credo.experiments.table_3_1 import names as memory_cells
+from credo.experiments.memories import ROLES
+from credo.experiments.memories import names as memory_cells
 from credo.report.rows import Results, Row, Series, concat, rows, series
 
 Found = Iterator[Row | Series]
@@ -227,7 +227,7 @@ def roles(cell: dict[str, Any], labels: Labels, seeds: list[int]) -> Found:
     for seed, cells in zip(seeds, cell.pop("roles"), strict=True):
         for role in cells:
             here = {**labels, "cell": memory_cells(len(cells))[cells.index(role)]}
-            yield from (Row(here, seed, METRICS[k], role.pop(k)) for k in METRICS)
+            yield from (Row(here, seed, ROLES[k], role.pop(k)) for k in ROLES)
             assert not role
 
 

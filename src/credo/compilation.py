@@ -16,7 +16,7 @@ import numpy as np
 
 def cache_directory() -> pathlib.Path | None:
     """Where compiled programs are kept: `$CREDO_CACHE`, or `credo` in `$XDG_CACHE_HOME` or
-    `~/.cache`. None if nothing can be written there, or nobody knows where home is."""
+    `~/.cache`. None if nothing can be written there, or it is not known where home is."""
     try:
         named = os.environ.get("CREDO_CACHE")
         home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"

@@ -21,7 +21,7 @@ from .compilation import jit
 from .types import Transition
 
 _filled = contextvars.ContextVar("_filled", default=True)
-SMALL = 2**28  # bytes for which nobody asks whether there is room
+SMALL = 2**28  # bytes for which it is not asked whether there is room
 BLOCK = 1024  # rows that come from the host at a time: one shape, so one program
 
 

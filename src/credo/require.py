@@ -1,15 +1,27 @@
 """Checks of arguments: each says what was given and what is allowed."""
 
+import dataclasses
 import difflib
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 
 def choice(name: str, value: str, allowed: Iterable[str]) -> None:
     """Raise unless `value` is one of `allowed`."""
     if value not in allowed:
         raise ValueError(f"{name} is {value!r}: it must be one of {', '.join(sorted(allowed))}")
+
+
+def literals(config: Any) -> None:
+    """Raise unless every field that is annotated as a `Literal` has one of its values, or None
+    where the annotation allows it."""
+    for field in dataclasses.fields(config):
+        kinds = (field.type, *get_args(field.type))
+        none = getattr(config, field.name) is None and type(None) in kinds
+        for kind in kinds:
+            if get_origin(kind) is Literal and not none:
+                choice(field.name, getattr(config, field.name), get_args(kind))
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

@@ -8,6 +8,7 @@ Copy this one file to where the policy is to act: it needs nothing else of Credo
 numbers and names in a safetensors file; nothing in it is executed.
 """
 
+import dataclasses
 import hashlib
 import json
 import math
@@ -30,7 +31,11 @@ Weights = dict[str, np.ndarray]
 
 
 class Runner:
-    """A policy that acts. Its memory, if it has one, is kept between calls."""
+    """A policy that acts. Its memory, if it has one, is kept between calls.
+
+    `obs_size` and `action_size` are numbers in an observation and in an action, of a team for each
+    of `agents`, which is None for a policy of one. `description` is what the file says of it.
+    """
 
     def __init__(self, description: dict[str, Any], weights: Weights):
         if description["version"] not in (1, VERSION):
@@ -42,12 +47,12 @@ class Runner:
             network = {"type": description["network"], "config": description["config"]}
             description = description | {"network": network}
         self.description, self._units = description, Units(description)
-        self.obs_size, self.action_size = self._units.obs_size, self._units.action_size
-        self.agents = self._units.agents  # None: it is no team
-        claim = Claim(weights)
-        sizes = (self.obs_size, self.action_size, self.agents)
-        self._network = build(description["network"], claim, *sizes)
-        claim.all_claimed()
+        sizes = self._units.obs_size, self._units.action_size, self._units.agents
+        self.obs_size, self.action_size, self.agents = sizes
+        left = set(weights)
+        self._network = Node(description["network"], weights, left, *sizes).build()
+        for name in sorted(left):
+            raise ValueError(_mismatch(name, weights[name].shape, None))
         self._try()
 
     @classmethod
@@ -87,6 +92,9 @@ class Runner:
         an integer; for any other task `[action_size]`, float32 in [-1, 1]. Of a team a list of
         these, None for an agent that is not there, or a dict if the observation is one; for a task
         of Credo's `[agents, action_size]`.
+
+        **Raises:** `ValueError` for an observation or a mask that the task cannot have, and if the
+        policy's output is not finite.
         """
         return self._units.act(observation, self._step, mask)
 
@@ -112,6 +120,8 @@ class Units:
     `task` has `obs_size`, `action_size`, `agents` (None: no team); `action` or `actions`: None for
     [-1, 1], or a description of the action space, of a team one for each agent; and where they are
     known `observations` ({"n", "start"} of a Discrete) and `names` of the agents.
+
+    **Raises:** `ValueError`, or what Python raises, if that makes no sense.
     """
 
     def __init__(self, task: Mapping[str, Any]):
@@ -121,9 +131,17 @@ class Units:
         if agents is not None:
             self.agents = _size("agents", agents, MOST_AGENTS)
         self.names = self._one_each("names", task.get("names"))
-        self._discrete = self._observed(task.get("observations"))
+        self._discrete = task.get("observations") if agents is None else None
+        if self._discrete is not None:
+            n, start = self._discrete["n"], self._discrete["start"]
+            if n != self.obs_size or type(start) is not int:
+                raise ValueError(f"observations are {self._discrete}: n must be {self.obs_size}")
         spaces = task.get("action", task.get("actions"))
-        self._own = None if spaces is None else self._scales(spaces)
+        if agents is None and spaces is not None:
+            spaces = [spaces]
+        elif spaces is not None:
+            self._one_each("actions", spaces)
+        self._own = None if spaces is None else list(map(self._scale, spaces))
 
     def act(self, observation: Any, step: Callable[[np.ndarray], Any], mask: Any = None) -> Any:
         """The action in the task's units that follows from `step`, a policy on float32 arrays."""
@@ -137,19 +155,18 @@ class Units:
         if isinstance(observation, Mapping):
             return {name: own[k] for k, name in enumerate(self.names) if name in observation}
         if isinstance(own, list):
-            absent = [row is None for row in observation]
-            return [None if gone else action for gone, action in zip(absent, own, strict=True)]
+            rows = zip(observation, own, strict=True)
+            return [None if row is None else action for row, action in rows]
         return own
 
     def read(self, observation: Any) -> np.ndarray:
         """`[obs_size]`, of a team `[agents, obs_size]`, float32. Raises `ValueError`."""
         if self.agents is None:
-            return self._row(observation, self._discrete)
+            return self._row(observation)
         if isinstance(observation, Mapping):
             observation = self._by_name(observation)
-        if not isinstance(observation, np.ndarray | list | tuple) or (
-            len(observation) != self.agents
-        ):
+        given = isinstance(observation, np.ndarray | list | tuple)
+        if not given or len(observation) != self.agents:
             raise ValueError(
                 f"the observation is {observation!r}: it must be that of each of {self.agents} "
                 "agents, in order, None for one that is not there"
@@ -157,24 +174,25 @@ class Units:
         rows = np.zeros((self.agents, self.obs_size), np.float32)
         for k, row in enumerate(observation):
             if row is not None:
-                row = self._row(row, self._discrete)
+                row = self._row(row)
                 rows[k, : row.size] = row
         return rows
 
     def own(self, output: np.ndarray, mask: Any) -> Any:
         """An action in [-1, 1] in the task's units."""
-        if self._own is None or self.agents is None:
-            if self._own is None and mask is not None:
-                raise ValueError("a mask was given: only a Discrete has entries to allow")
-            return output if self._own is None else self._own[0](output, mask)
+        if self._own is None:
+            _no_mask(mask)
+            return output
+        if self.agents is None:
+            return self._own[0](output, mask)
         masks = [None] * self.agents if mask is None else self._one_each("mask", mask)
         return [own(row, mask) for own, row, mask in zip(self._own, output, masks, strict=True)]
 
-    def _row(self, observation: Any, discrete: Mapping[str, Any] | None) -> np.ndarray:
-        if discrete is not None and np.ndim(observation) == 0:
-            return _one_hot(observation, **discrete)
+    def _row(self, observation: Any) -> np.ndarray:
+        """The observation of one agent. In a team of others it may be shorter than the largest."""
+        if self._discrete is not None and np.ndim(observation) == 0:
+            return _one_hot(observation, self._discrete["n"], self._discrete["start"])
         x = np.asarray(observation, np.float32).ravel()
-        # Teams of others are padded to the largest observation.
         padded = self.agents is not None and self._own is not None
         if x.size > self.obs_size or (x.size < self.obs_size and not padded):
             raise ValueError(f"the observation has {x.size} numbers: it must have {self.obs_size}")
@@ -184,10 +202,11 @@ class Units:
         return x
 
     def _by_name(self, observation: Mapping[Any, Any]) -> list[Any]:
+        """An entry for each agent, None for those that are not named."""
         strangers = [name for name in observation if name not in (self.names or ())]
         if strangers or self.names is None:
             raise ValueError(
-                f"the observation names {strangers[:1] or 'nobody'}: this team has "
+                f"the observation names {strangers[:1] or 'no agent'}: this team has "
                 f"{self.names or 'no names, so give a row for each agent'}"
             )
         return [observation.get(name) for name in self.names]
@@ -197,17 +216,14 @@ class Units:
             raise ValueError(f"{what} is {values!r}: it must have one entry for each agent")
         return values
 
-    def _observed(self, discrete: Any) -> Mapping[str, Any] | None:
-        if discrete is None or self.agents is not None:
-            return None
-        n, start = discrete["n"], discrete["start"]
-        if n != self.obs_size or type(start) is not int:
-            raise ValueError(f"observations are {discrete}: n must be {self.obs_size}")
-        return {"n": n, "start": start}
-
-    def _scales(self, spaces: Any) -> list[Callable[[np.ndarray, Any], Any]]:
-        spaces = [spaces] if self.agents is None else self._one_each("actions", spaces)
-        return [_scale(space, self.action_size, self.agents is None) for space in spaces]
+    def _scale(self, space: Any) -> Callable[[np.ndarray, Any], Any]:
+        """What turns an action in [-1, 1], and a mask of a Discrete or None, into a space's own. In
+        a team a space may be smaller than the largest: it takes as much as it holds."""
+        size, read = _entries(space) if "n" in space else _box(space)
+        if size > self.action_size or (self.agents is None and size < self.action_size):
+            has = f"an action has {size} numbers in its space"
+            raise ValueError(f"{has}, and {self.action_size} as such")
+        return read
 
 
 def _size(what: str, n: Any, most: int | None = None) -> int:
@@ -218,31 +234,27 @@ def _size(what: str, n: Any, most: int | None = None) -> int:
 
 
 def _one_hot(observation: Any, n: int, start: int) -> np.ndarray:
+    """`[n]` of an integer from `start` on."""
     entry = np.asarray(observation)
     if entry.dtype.kind not in "iu" or not start <= entry < start + n:
+        last = start + n - 1
         raise ValueError(
-            f"the observation is {observation!r}: it must be an integer from {start} to "
-            f"{start + n - 1}"
+            f"the observation is {observation!r}: it must be an integer from {start} to {last}"
         )
     return (np.arange(start, start + n) == entry).astype(np.float32)
 
 
-def _scale(space: Any, action_size: int, alone: bool) -> Callable[[np.ndarray, Any], Any]:
-    """What turns an action in [-1, 1], and a mask of a Discrete or None, into a space's own. In a
-    team a space may be smaller than the largest: it takes as much of the action as it holds."""
-    if "n" in space:
-        size, start = _size("n", space["n"]), space["start"]
-        if type(start) is not int:
-            raise ValueError(f"start is {start!r}: it must be an integer")
-        read = _largest(size, start)
-    else:
-        size, read = _box(space)
-    if size > action_size or (alone and size < action_size):
-        raise ValueError(f"an action has {size} numbers in its space, and {action_size} as such")
-    return read
+def _no_mask(mask: Any) -> None:
+    if mask is not None:
+        raise ValueError("a mask was given: only a Discrete has entries to allow")
 
 
-def _largest(n: int, start: int) -> Callable[[np.ndarray, Any], int]:
+def _entries(space: Any) -> tuple[int, Callable[[np.ndarray, Any], int]]:
+    """Of a Discrete the number of entries, and what picks the largest that a mask allows."""
+    n, start = _size("n", space["n"]), space["start"]
+    if type(start) is not int:
+        raise ValueError(f"start is {start!r}: it must be an integer")
+
     def choose(output: np.ndarray, mask: Any) -> int:
         output = output[:n]
         if mask is not None:
@@ -252,10 +264,12 @@ def _largest(n: int, start: int) -> Callable[[np.ndarray, Any], int]:
             output = np.where(mask, output, -np.inf)
         return int(np.argmax(output)) + start
 
-    return choose
+    return n, choose
 
 
 def _box(space: Any) -> tuple[int, Callable[[np.ndarray, Any], np.ndarray]]:
+    """Of a Box the number of numbers, and what scales an action to its bounds; one of integers gets
+    the nearest."""
     low, high = np.array(space["low"], np.float64), np.array(space["high"], np.float64)
     shape, dtype = tuple(space["shape"]), np.dtype(space["dtype"])
     bounded = np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()
@@ -264,18 +278,74 @@ def _box(space: Any) -> tuple[int, Callable[[np.ndarray, Any], np.ndarray]]:
     if dtype.kind not in "fiu":
         raise ValueError(f"its action space has dtype {dtype}: it must be one of numbers")
     center, half, size = (low + high) / 2, (high - low) / 2, low.size
-    whole = dtype.kind != "f"
 
     def scale(output: np.ndarray, mask: Any) -> np.ndarray:
-        if mask is not None:
-            raise ValueError("a mask was given: only a Discrete has entries to allow")
+        _no_mask(mask)
         own = np.minimum(np.maximum(center + half * output[:size], low), high)
-        return (np.rint(own) if whole else own).astype(dtype).reshape(shape)
+        return (own if dtype.kind == "f" else np.rint(own)).astype(dtype).reshape(shape)
 
     return size, scale
 
 
 # ----------------------------------------------------------------------------------- networks
+
+
+@dataclasses.dataclass(frozen=True)
+class Node:
+    """A network as a file describes it, and the file's arrays, to be claimed by name and shape.
+
+    A network is built of a node, and has `start(random) -> memory` and `(x, memory) -> (action in
+    [-1, 1], memory)`, where x is `[obs_size]`, of a team `[agents, obs_size]`, float32.
+    """
+
+    described: Any  # {"type", "config", "parts"}: its class, its settings, the networks within
+    weights: Weights
+    left: set[str]  # names of the arrays that no network has claimed
+    x: int  # numbers in an observation
+    y: int  # numbers in an action
+    agents: Any = None  # how many; None: no team
+    prefix: str = ""  # of the names of its arrays
+    depth: int = 0  # networks around it
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The network's settings."""
+        return self.described["config"]
+
+    def build(self) -> Any:
+        """The network. Raises `ValueError`, or what Python raises, if the description makes no
+        sense."""
+        if self.depth >= DEEPEST:
+            raise ValueError(f"its networks lie in one another more than {DEEPEST} deep")
+        kind, team = NETWORKS[self.described["type"]]
+        if team not in (None, self.agents is not None):
+            name = self.described["type"]
+            raise ValueError(f"{name} cannot act for {self.agents or 1} agents here")
+        return kind(self)
+
+    def claim(self, name: str, *shape: int) -> np.ndarray:
+        """The array of this name, which must have this shape and be claimed once."""
+        name = self.prefix + name
+        array = self.weights.get(name)
+        sound = all(type(n) is int and n > 0 for n in shape)
+        if not sound or array is None or array.shape != shape or name not in self.left:
+            raise ValueError(_mismatch(name, None if array is None else array.shape, shape))
+        self.left.remove(name)
+        return array
+
+    def within(self, prefix: str) -> "Node":
+        """The same network, for arrays whose names start so."""
+        return dataclasses.replace(self, prefix=f"{self.prefix}{prefix}.")
+
+    def part(self, i: int, prefix: str, x: int, y: int, agents: int | None = None) -> Any:
+        """A network within."""
+        described, depth = self.described["parts"][i], self.depth + 1
+        given = {"described": described, "x": x, "y": y, "agents": agents, "depth": depth}
+        return dataclasses.replace(self.within(prefix), **given).build()
+
+
+def _mismatch(name: str, found: Any, expected: Any) -> str:
+    return f"its network does not have such weights: {name} has shape {found}, expected {expected}"
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
@@ -297,68 +367,15 @@ def _act(x: np.ndarray, activation: str) -> tuple[np.ndarray, np.ndarray]:
     return y, 2.0 * y - 1.0 if activation == "sigmoid" else y
 
 
-class Claim:
-    """The arrays of a file, for networks to claim by name and shape."""
-
-    def __init__(self, weights: Weights, prefix: str = "", left: set[str] | None = None):
-        self._weights, self._prefix = weights, prefix
-        self._left = set(weights) if left is None else left
-
-    def __call__(self, name: str, *shape: int) -> np.ndarray:
-        name = self._prefix + name
-        array = self._weights.get(name)
-        sound = all(type(n) is int and n > 0 for n in shape)
-        if not sound or array is None or array.shape != shape or name not in self._left:
-            found = None if array is None else array.shape
-            raise ValueError(_mismatch(name, found, shape))
-        self._left.remove(name)
-        return array
-
-    def within(self, prefix: str) -> "Claim":
-        """Those whose names start so."""
-        return Claim(self._weights, f"{self._prefix}{prefix}.", self._left)
-
-    def all_claimed(self) -> None:
-        for name in sorted(self._left):
-            raise ValueError(_mismatch(name, self._weights[name].shape, None))
-
-
-def _mismatch(name: str, found: Any, expected: Any) -> str:
-    return f"its network does not have such weights: {name} has shape {found}, expected {expected}"
-
-
-def build(
-    node: Any, claim: Claim, x: int, y: int, agents: int | None = None, depth: int = 0
-) -> Any:
-    """The network that a description names, for `x` numbers in an observation and `y` in an
-    action, of a team for each agent."""
-    if depth >= DEEPEST:
-        raise ValueError(f"its networks lie in one another more than {DEEPEST} deep")
-    kind = NETWORKS[node["type"]]
-    if kind.team is not None and kind.team != (agents is not None):
-        raise ValueError(f"{node['type']} cannot act for {agents or 1} agents here")
-    if agents is None and not kind.parts:
-        return kind(node["config"], claim, x, y)
-    parts = node.get("parts", [])
-
-    def part(i: int, prefix: str, x: int, y: int, agents: int | None = None) -> Any:
-        return build(parts[i], claim.within(prefix), x, y, agents, depth + 1)
-
-    return kind(node["config"], claim, x, y, agents, part)
-
-
 class MLP:
-    """`credo.networks.mlp`: `W_l`, `b_l` of each layer l, `g_l`, `s_l` of its LayerNorm."""
+    """`credo.networks.mlp`: `W_l`, `b_l` of each layer l, `g_l`, `s_l` of its LayerNorm. It has no
+    memory."""
 
-    team: ClassVar[bool | None] = False
-    parts: ClassVar[bool] = False
-
-    def __init__(self, config: dict[str, Any], claim: Claim, x: int, y: int):
-        self._hidden = Layers(config, claim, x)
-        self._depth = len(config["hidden"])
-        self._w = claim(f"W_{self._depth}", y, self._hidden.size)
-        self._b = claim(f"b_{self._depth}", y)
-        self._activation = config["output_activation"]
+    def __init__(self, node: Node):
+        self._hidden, depth = Layers(node, node.config), len(node.config["hidden"])
+        self._w = node.claim(f"W_{depth}", node.y, self._hidden.size)
+        self._b = node.claim(f"b_{depth}", node.y)
+        self._activation = node.config["output_activation"]
 
     def start(self, random: "np.random.Generator") -> None:
         return None
@@ -370,16 +387,16 @@ class MLP:
 class Layers:
     """Hidden layers: those of an MLP, and a team's trunk."""
 
-    def __init__(self, config: dict[str, Any], claim: Claim, x: int):
+    def __init__(self, node: Node, config: dict[str, Any]):
         self._normalization, self._layers = config["normalization"], []
-        self._activation = ACTIVATIONS[config["activation"]]
+        self._activation, x = ACTIVATIONS[config["activation"]], node.x
         for i, units in enumerate(config["hidden"]):
-            layer = [claim(f"W_{i}", units, x), claim(f"b_{i}", units)]
+            layer = [node.claim(f"W_{i}", units, x), node.claim(f"b_{i}", units)]
             if self._normalization != "none":
-                layer += [claim(f"g_{i}", units), claim(f"s_{i}", units)]
+                layer += [node.claim(f"g_{i}", units), node.claim(f"s_{i}", units)]
             self._layers.append(layer)
             x = units
-        self.size = x
+        self.size = x  # of the last one
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         for w, b, *norm in self._layers:
@@ -393,6 +410,7 @@ class Layers:
 
 
 def _normalize(x: np.ndarray, gain: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """LayerNorm."""
     x = x - np.mean(x)
     x = x / np.sqrt(np.mean(np.square(x)) + np.float32(EPSILON))
     return gain * x + shift
@@ -401,15 +419,13 @@ def _normalize(x: np.ndarray, gain: np.ndarray, shift: np.ndarray) -> np.ndarray
 class MMU:
     """`credo.networks.mmu`: Khadka (2019), equations 3.1-3.5. The memory is (y, m)."""
 
-    team: ClassVar[bool | None] = False
-    parts: ClassVar[bool] = False
-
-    def __init__(self, config: dict[str, Any], claim: Claim, x: int, y: int):
-        self.config = config
-        self.weights = {name: claim(name, *shape) for name, shape in self._shapes(config, x, y)}
+    def __init__(self, node: Node):
+        self.config, shapes = node.config, self._shapes(node.config, node.x, node.y)
+        self.weights = {name: node.claim(name, *shape) for name, shape in shapes}
 
     @staticmethod
     def _shapes(config: dict[str, Any], x: int, y: int):
+        """The names and shapes of its arrays, as the equations have them."""
         h = config["hidden"]
         m = h if config["memory"] is None else config["memory"]
         for gate, size in (("i", h), ("r", h), ("w", m)):
@@ -451,22 +467,18 @@ class MMU:
 
 
 class Recurrent:
-    """`credo.networks.recurrent`: Elman RNN, GRU and LSTM. The memory is (h, c)."""
+    """`credo.networks.recurrent`: Elman RNN, GRU and LSTM. The memory is (h, c), of which c is used
+    by the LSTM alone."""
 
-    team: ClassVar[bool | None] = False
-    parts: ClassVar[bool] = False
     GATES: ClassVar[dict[str, str]] = {"rnn": "h", "gru": "zrh", "lstm": "ifoc"}
 
-    def __init__(self, config: dict[str, Any], claim: Claim, x: int, y: int):
-        self.cell, self._activation, h = (
-            config["cell"],
-            config["output_activation"],
-            config["hidden"],
-        )
-        self.weights = {"Z_y": claim("Z_y", y, h), "b_y": claim("b_y", y)}
+    def __init__(self, node: Node):
+        self.cell, self._activation = node.config["cell"], node.config["output_activation"]
+        h = node.config["hidden"]
+        self.weights = {"Z_y": node.claim("Z_y", node.y, h), "b_y": node.claim("b_y", node.y)}
         for gate in self.GATES[self.cell]:
-            shapes = {f"W_{gate}": (h, x), f"U_{gate}": (h, h), f"b_{gate}": (h,)}
-            self.weights |= {name: claim(name, *shape) for name, shape in shapes.items()}
+            shapes = {f"W_{gate}": (h, node.x), f"U_{gate}": (h, h), f"b_{gate}": (h,)}
+            self.weights |= {name: node.claim(name, *shape) for name, shape in shapes.items()}
 
     def start(self, random: "np.random.Generator") -> tuple[np.ndarray, np.ndarray]:
         zeros = np.zeros(self.weights["Z_y"].shape[1], np.float32)
@@ -494,23 +506,22 @@ class Team:
     """`credo.networks.team`: a head for each agent on a trunk, of each one or one for all. The
     memory is that of each head."""
 
-    team: ClassVar[bool | None] = True
-    parts: ClassVar[bool] = True
+    OWN: ClassVar[dict[str, tuple[bool, bool]]] = {  # by what is shared: own trunks, own heads
+        "trunk": (False, True),
+        "everything": (False, False),
+        "nothing": (True, True),
+    }
 
-    def __init__(self, config: Any, claim: Claim, x: int, y: int, agents: int, part: Any):
-        own_trunks, own_heads = {
-            "trunk": (False, True),
-            "everything": (False, False),
-            "nothing": (True, True),
-        }[config["sharing"]]
-        layers = config | {"hidden": config["trunk"], "normalization": "none"}
+    def __init__(self, node: Node):
+        own_trunks, own_heads = self.OWN[node.config["sharing"]]
+        layers = node.config | {"hidden": node.config["trunk"], "normalization": "none"}
 
         def each(own: bool, made: Callable[[int], Any]) -> list[Any]:
-            return [made(k) for k in range(agents)] if own else [made(0)] * agents
+            return [made(k) for k in range(node.agents)] if own else [made(0)] * node.agents
 
-        self._trunks = each(own_trunks, lambda k: Layers(layers, claim.within(f"trunks.{k}"), x))
+        self._trunks = each(own_trunks, lambda k: Layers(node.within(f"trunks.{k}"), layers))
         size = self._trunks[0].size
-        self._heads = each(own_heads, lambda k: part(k, f"heads.{k}", size, y))
+        self._heads = each(own_heads, lambda k: node.part(k, f"heads.{k}", size, node.y))
 
     def start(self, random: "np.random.Generator") -> list[Any]:
         return [head.start(random) for head in self._heads]
@@ -525,17 +536,14 @@ class DMMU:
     """`credo.networks.dmmu`: agents around one memory, each an MMU or a recurrent network. The
     memory is (what is private to each, m, the generator of random orders)."""
 
-    team: ClassVar[bool | None] = True
-    parts: ClassVar[bool] = True
-
-    def __init__(self, config: Any, claim: Claim, x: int, y: int, agents: int, part: Any):
+    def __init__(self, node: Node):
         # The last number says who takes part: 1 acts, 0 is busy, -1 is away.
-        self._least = {"everyone": None, "present": -0.5, "acting": 0.5}[config["access"]]
-        self._order, self._y = config["order"], y
+        least = {"everyone": None, "present": -0.5, "acting": 0.5}[node.config["access"]]
+        self._least, self._order, self._y = least, node.config["order"], node.y
         if self._order not in ("sequential", "simultaneous", "random"):
             raise ValueError(f"its order is {self._order!r}")
-        inputs = x if self._least is None else x - 1
-        self._agents = [part(i, f"agents.{i}", inputs, y) for i in range(agents)]
+        x = node.x if least is None else node.x - 1
+        self._agents = [node.part(i, f"agents.{i}", x, node.y) for i in range(node.agents)]
         if not all(isinstance(agent, MMU | Recurrent) for agent in self._agents):
             raise ValueError("its agents must be MMUs or recurrent networks")
         # Of GRUs and Elman networks the state itself is shared, of LSTMs the cell.
@@ -567,14 +575,10 @@ class DMMU:
 class Centralized:
     """`credo.networks.team`: one network for all agents."""
 
-    team: ClassVar[bool | None] = True
-    parts: ClassVar[bool] = True
-
-    def __init__(self, config: Any, claim: Claim, x: int, y: int, agents: int, part: Any):
-        self._inner, self._agents = part(0, "policy", agents * x, agents * y), agents
-
-    def start(self, random: "np.random.Generator") -> Any:
-        return self._inner.start(random)
+    def __init__(self, node: Node):
+        self._agents = n = node.agents
+        self._inner = node.part(0, "policy", n * node.x, n * node.y)
+        self.start = self._inner.start
 
     def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
         action, memory = self._inner(x.ravel(), memory)
@@ -585,26 +589,28 @@ class Normalized:
     """`credo.networks.normalized`: observations with mean 0 and standard deviation 1, of each agent
     of a team, clipped to [-10, 10], for the network within."""
 
-    team: ClassVar[bool | None] = None  # that of the network within
-    parts: ClassVar[bool] = True
-
-    def __init__(self, config: Any, claim: Claim, x: int, y: int, agents: int | None, part: Any):
-        shape = (x,) if agents is None else (agents, x)
-        self._mean, self._std = claim("mean", *shape), claim("std", *shape)
+    def __init__(self, node: Node):
+        shape = (node.x,) if node.agents is None else (node.agents, node.x)
+        self._mean, self._std = node.claim("mean", *shape), node.claim("std", *shape)
         if not (self._std > 0).all():
             raise ValueError(f"std is {self._std}: it must be more than 0")
-        self._inner = part(0, "policy", x, y, agents)
-
-    def start(self, random: "np.random.Generator") -> Any:
-        return self._inner.start(random)
+        self._inner = node.part(0, "policy", node.x, node.y, node.agents)
+        self.start = self._inner.start
 
     def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
         return self._inner(np.clip((x - self._mean) / self._std, -10.0, 10.0), memory)
 
 
-NETWORKS: dict[str, Any] = {
-    kind.__name__: kind for kind in (MLP, MMU, Recurrent, Team, DMMU, Centralized, Normalized)
+NETWORKS: dict[str, tuple[Callable[[Node], Any], bool | None]] = {
+    "MLP": (MLP, False),
+    "MMU": (MMU, False),
+    "Recurrent": (Recurrent, False),
+    "Team": (Team, True),
+    "DMMU": (DMMU, True),
+    "Centralized": (Centralized, True),
+    "Normalized": (Normalized, None),
 }
+"""By name in a file; and whether it acts for a team or, False, for one. None: as that within."""
 
 
 # ----------------------------------------------------------------------------------- the file

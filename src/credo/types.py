@@ -1,6 +1,6 @@
 """The records that cross module borders. Every one is a pytree."""
 
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,7 +27,7 @@ class TimeStep(eqx.Module):
     terminated: Bool[Array, ""]  # the task ended: do not bootstrap
     truncated: Bool[Array, ""]  # the clock ran out: do bootstrap
     active: Bool[Array, " agents"] | None = None
-    gone: Bool[Array, " agents"] | None = None  # None: nobody before the episode ends
+    gone: Bool[Array, " agents"] | None = None  # None: none before the episode ends
 
     @property
     def ended(self) -> Bool[Array, "*agents"]:
@@ -150,6 +150,13 @@ class Trace(eqx.Module):
             truncated=np.asarray(self.truncated),
             length=np.int32(steps),
         )
+
+
+class Bound(NamedTuple):
+    """A mean return that no policy exceeds."""
+
+    value: float
+    kind: Literal["optimal", "upper bound"]  # some policy reaches it, or perhaps none does
 
 
 def plain(x: Array | np.ndarray) -> np.ndarray:

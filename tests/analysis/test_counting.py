@@ -99,13 +99,6 @@ def test_a_cell_that_turns_round_is_no_counter():
     assert kept.counted[0, 0, :, 0].tolist() == [0, 1]
 
 
-def test_the_report_names_the_cell_and_the_count(study):
-    lines = study.report(1).splitlines()
-    assert lines[1].split() == ["1", "0", "32.00", "-33.00", "0.00"]
-    assert lines[-2] == "M2 counted -1 to the end"
-    assert lines[-1] == "M1 counted +1 up to 7, then stopped"
-
-
 def test_longest_correct_finds_the_first_mistake(three):
     key = jax.random.key(1)
     found = counting.longest_correct(three, 300, 4, key=key)

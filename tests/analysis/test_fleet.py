@@ -1,4 +1,4 @@
-"""Floors and ceilings of the server fleet, against the enumeration of tiny fleets."""
+"""Baselines and upper bound of the server fleet, against the enumeration of tiny fleets."""
 
 import dataclasses
 import itertools
@@ -8,17 +8,19 @@ import jax
 import numpy as np
 import pytest
 
+from credo.analysis import bounds
 from credo.analysis.fleet import (
     _chance,
     best_discovery,
     discovering_fleet,
     fixed_fleet,
-    floors_and_ceilings,
     play_fleet,
     play_oracle,
-    starts,
+    played,
     trace_fleet,
 )
+from credo.analysis.scripts import starts
+from credo.analysis.statistics import mean_and_standard_error
 from credo.environments.server_fleet import ServerFleet
 from credo.networks.dmmu import DMMU
 
@@ -54,17 +56,23 @@ def near(row, exact, errors=4.0):
     return abs(mean - exact) <= errors * error + 1e-6
 
 
+def references(env):
+    """Mean net requests and standard error of every script, and of the oracle."""
+    nets = played(env, 2000) | played(env, 2000, oracle=True)
+    return {name: mean_and_standard_error(net) for name, net in nets.items()}
+
+
 @pytest.fixture(scope="module")
 def tiny():
-    return floors_and_ceilings(TINY, 2000, key=KEY)
+    return references(TINY)
 
 
 @pytest.fixture(scope="module")
 def case():
-    return floors_and_ceilings(CASE, 2000, key=KEY)
+    return references(CASE)
 
 
-def test_floors_are_the_enumerated_ones(tiny):
+def test_baselines_are_the_enumerated_ones(tiny):
     joint = [*itertools.product(range(3), repeat=2)]
     assert list(tiny) == ["random", "fixed", "discovering", "oracle"]
     assert 0 < tiny["random"][1] < 0.05
@@ -110,7 +118,7 @@ def test_where_all_are_nefarious_the_oracle_loses_one_device():
     assert (net == -2).all()
 
 
-def test_discovering_lies_between_the_floors_and_the_exact_best(case, tiny):
+def test_discovering_lies_between_the_baselines_and_the_exact_best(case, tiny):
     for env, rows in ((CASE, case), (TINY, tiny)):
         best = best_discovery(env)
         mean, error = rows["discovering"]
@@ -118,6 +126,12 @@ def test_discovering_lies_between_the_floors_and_the_exact_best(case, tiny):
         assert best <= rows["oracle"][0]
     assert case["oracle"] == (6.0, 0.0)
     assert case["discovering"][0] > 4.0
+
+
+def test_the_one_way_in_gives_the_same_means():
+    nets = played(TINY)
+    assert bounds.baselines(TINY) == {name: net.mean() for name, net in nets.items()}
+    assert bounds.upper_bound(TINY) == (2.0, "upper bound")
 
 
 def test_the_exact_best_is_the_mean_of_the_published_case_study():
@@ -144,11 +158,12 @@ def test_the_exact_best_by_hand(devices, nefarious, requests, rounds, exact):
 
 def test_one_discovering_server_by_hand():
     env = ServerFleet(servers=1, devices=2, requests=2, nefarious=1, max_steps=6)
-    states = starts(env, 50, key=KEY)
-    net = np.asarray(play_fleet(env, states, discovering_fleet(env), key=KEY))
-    np.testing.assert_array_equal(net, np.where(np.asarray(states.genuine)[:, 0], 2.0, 1.0))
-    net = np.asarray(play_fleet(env, states, fixed_fleet(env), key=KEY))
-    np.testing.assert_array_equal(net, np.where(np.asarray(states.genuine)[:, 0], 2.0, -2.0))
+    begun = starts(env, 50, key=KEY)
+    genuine = np.asarray(begun[0].genuine)
+    net = np.asarray(play_fleet(env, begun, discovering_fleet(env), key=KEY))
+    np.testing.assert_array_equal(net, np.where(genuine[:, 0], 2.0, 1.0))
+    net = np.asarray(play_fleet(env, begun, fixed_fleet(env), key=KEY))
+    np.testing.assert_array_equal(net, np.where(genuine[:, 0], 2.0, -2.0))
 
 
 def test_what_is_known_of_an_unknown_device():

@@ -1,4 +1,4 @@
-"""Floors and ceilings of the Extended T-Maze, against enumeration and against the task itself."""
+"""Baselines and upper bounds of the Extended T-Maze, against enumeration and the task itself."""
 
 import dataclasses
 import functools
@@ -107,7 +107,7 @@ def test_a_robot_alone_that_counts_trials_beats_the_static_policy():
         assert tmaze.searching(env) == Fraction(3 * n + 5, 6 * n)
         assert tmaze.shared_information(env) == Fraction(3 * n + 5, 6 * n)
         assert tmaze.imitating(env) == tmaze.static_alone(env) == Fraction(3 * n + 1, 6 * n)
-        assert tmaze.ceiling(env) == ("optimal", float(Fraction(3 * n + 5, 6 * n)))
+        assert tmaze.upper_bound(env) == (float(Fraction(3 * n + 5, 6 * n)), "optimal")
 
 
 @pytest.mark.parametrize("rules", RULES)
@@ -115,7 +115,7 @@ def test_a_robot_alone_that_counts_trials_beats_the_static_policy():
 def test_the_optimum_is_that_of_trying_everything(rules, partner):
     env = task(1, *rules, partner)
     assert tmaze.optimal(env) == enumerated(env)
-    assert tmaze.ceiling(env) == ("optimal", float(enumerated(env)))
+    assert tmaze.upper_bound(env) == (float(enumerated(env)), "optimal")
 
 
 @pytest.mark.parametrize("rules", RULES)
@@ -123,10 +123,10 @@ def test_the_optimum_beside_fsp_at_depth_2(rules):
     env = task(2, *rules)
     best = tmaze.optimal(env)
     assert best == enumerated(env)
-    # The arguments of `ceiling` give the same for any depth.
+    # The arguments of `upper_bound` give the same for any depth.
     assert best == (Fraction(61, 72) if rules[0] == "spread" else Fraction(13, 24))
     assert best == (tmaze.searching(env) if rules[0] == "spread" else tmaze.imitating(env))
-    assert tmaze.ceiling(env) == ("optimal", float(best))
+    assert tmaze.upper_bound(env) == (float(best), "optimal")
 
 
 def test_the_optimum_beside_resp_at_depth_2():
@@ -134,19 +134,19 @@ def test_the_optimum_beside_resp_at_depth_2():
     for rules, best in zip(RULES, expected, strict=True):
         env = task(2, *rules, "resp")
         assert tmaze.optimal(env) == best
-        assert best < tmaze.ceiling(task(2, *rules))[1]  # "provably lower" than beside FSP
+        assert best < tmaze.upper_bound(task(2, *rules)).value  # "provably lower" than beside FSP
         assert best > max(tmaze.searching(env), tmaze.imitating(env))
 
 
 def test_deeper_beside_resp_knowing_the_draw_is_the_bound():
     env = task(3, "spread", partner="resp")
-    assert tmaze.ceiling(env) == ("upper bound", float(tmaze.searching(task(3))))
+    assert tmaze.upper_bound(env) == (float(tmaze.searching(task(3))), "upper bound")
     assert tmaze.searching(env) < tmaze.searching(task(3)) < tmaze.shared_information(env)
 
 
 def test_with_moves_as_coded_the_plan_is_used():
     env = task(2, "converge", moves="as-coded")
-    assert tmaze.ceiling(env) == ("optimal", float(tmaze.optimal(env)))
+    assert tmaze.upper_bound(env) == (float(tmaze.optimal(env)), "optimal")
     assert tmaze.optimal(env) >= tmaze.imitating(env)
 
 
@@ -173,17 +173,17 @@ def test_scripts_score_the_same_in_the_task(rules, partner):
     assert in_the_task(env, search)(n - 1) == pytest.approx(float(tmaze.searching(env)), abs=1e-6)
 
 
-def test_floors_by_hand_at_depth_1():
+def test_baselines_by_hand_at_depth_1():
     # FSP goes 00 01 10 where the reward is at 0, then 1, then 0; and 01 10 01 at 1, 0, 1. So always
     # right misses the fifth trial or the third; always left the third, or the first and the fifth.
-    floors = tmaze.floors(task(1))
-    assert floors["always right"] == pytest.approx(5 / 6)
-    assert floors["always left"] == pytest.approx(3 / 4)
-    assert floors["static robot alone"] == floors["imitating FSP"] == pytest.approx(7 / 12)
-    assert "static robot alone" not in tmaze.floors(task(1, "converge"))
+    known = tmaze.baselines(task(1))
+    assert known["always right"] == pytest.approx(5 / 6)
+    assert known["always left"] == pytest.approx(3 / 4)
+    assert known["static robot alone"] == known["imitating FSP"] == pytest.approx(7 / 12)
+    assert "static robot alone" not in tmaze.baselines(task(1, "converge"))
 
 
-def test_feed_forward_networks_of_the_dissertation_reach_the_memoryless_floor():
+def test_feed_forward_networks_of_the_dissertation_reach_the_memoryless_baseline():
     for depth, published in ((2, 0.693), (3, 0.600)):
         assert max(tmaze.memoryless(task(depth)).values()) == pytest.approx(published, abs=0.007)
 
@@ -202,13 +202,13 @@ def test_feed_forward_networks_of_the_dissertation_reach_the_memoryless_floor():
 )
 def test_teams_without_a_static_robot(robots, objective, feedback, expected):
     env = task(2, objective, feedback, None, robots=robots)
-    name, share = tmaze.ceiling(env)
-    assert (name, pytest.approx(share)) == expected
+    share, kind = tmaze.upper_bound(env)
+    assert (kind, pytest.approx(share)) == expected
 
 
 def test_a_team_beside_the_static_robot_has_a_bound():
-    name, share = tmaze.ceiling(task(2, robots=2))
-    assert (name, share) == ("upper bound", pytest.approx((3.75 + 2 * 4) / 12))
+    share, kind = tmaze.upper_bound(task(2, robots=2))
+    assert (kind, share) == ("upper bound", pytest.approx((3.75 + 2 * 4) / 12))
 
 
 def test_what_cannot_be_asked_is_refused():
@@ -216,3 +216,8 @@ def test_what_cannot_be_asked_is_refused():
         tmaze.imitating(task(2, robots=2))
     with pytest.raises(ValueError, match="partner is None: give 'fsp' or 'resp'"):
         tmaze.optimal(task(2, partner=None))
+
+
+def test_a_team_without_memory_has_two_endpoints_to_go_to():
+    assert tmaze.baselines(task(2, partner=None, robots=3)) == {"one at each end": 0.5}
+    assert tmaze.baselines(task(3, partner=None, robots=2)) == {"one at each end": 0.25}

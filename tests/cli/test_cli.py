@@ -37,6 +37,7 @@ TRAIN = (
 
 
 MEAN = "mean ± standard error over episodes"
+LIST = "credo.cli.commands.List.__call__"
 
 
 @pytest.fixture(autouse=True)
@@ -251,14 +252,14 @@ def raising(error):
     ],
 )
 def test_whatever_a_command_raises_ends_in_one_line(credo, monkeypatch, command, code, told):
-    monkeypatch.setattr("credo.cli.list.run", command)
+    monkeypatch.setattr(LIST, staticmethod(command))
     ended, out, err = credo("list")
     assert (ended, out, len(err.splitlines())) == (code, "", 1)
     assert told in err
 
 
 def test_what_nobody_foresaw_leaves_its_traceback(credo, monkeypatch, tmp_path):
-    monkeypatch.setattr("credo.cli.list.run", user_error)
+    monkeypatch.setattr(LIST, staticmethod(user_error))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     _, _, err = credo("list")
     (log,) = tmp_path.iterdir()
@@ -268,7 +269,8 @@ def test_what_nobody_foresaw_leaves_its_traceback(credo, monkeypatch, tmp_path):
 
 
 def test_what_a_file_says_moves_no_cursor(credo, monkeypatch):
-    monkeypatch.setattr("credo.cli.list.run", raising(RunError("\x1b[2Jclean")))
+    error = RunError("\x1b[2Jclean")
+    monkeypatch.setattr(LIST, staticmethod(raising(error)))
     assert credo("list")[2] == "credo: \\x1b[2Jclean\n"
 
 
@@ -389,7 +391,8 @@ def test_evaluate_plays_fresh_episodes_of_any_depth(credo, run):
         "accuracy",
         "success",
         "steps",
-        "floor",
+        "baseline",
+        "upper",
     ]
     assert 3 <= float(lines[4].split()[1]) <= 4  # depth 2, a gap of 1 or 2
     assert credo(f"evaluate {run} --episodes 40")[1] == out
@@ -490,7 +493,7 @@ def test_what_resume_is_told_reaches_the_loop(credo, seeds, run, monkeypatch):
     monkeypatch.setattr("credo.runs.loop.resume", resumed)
     given = lambda jobs, **_: told.extend((j.path, j.again | vars(j.options)) for j in jobs)  # noqa: E731
     monkeypatch.setattr("credo.executors.local.run", given)
-    words = "--set mutation.strength=0.5 --set episodes=5 --trust --without-replay"
+    words = "--set mutation.strength=0.5 --set episodes=5 --trust --without-replay --generations 20"
     assert credo(f"resume {run} {words} --wall-clock 2m")[0] == 0
     assert credo(f"resume {seeds} {words}")[0] == 0
     assert [path for path, _ in told] == [run, *sorted(pathlib.Path(seeds).glob("*"), reverse=True)]
@@ -499,11 +502,22 @@ def test_what_resume_is_told_reaches_the_loop(credo, seeds, run, monkeypatch):
         assert (fields["trust"], fields["without_replay"]) == (True, True)
     assert told[0][1]["wall_clock"] == 120.0
     told.clear()
-    assert credo(f"resume {run} --set mutation-strength=0.25 --set elite_fraction=0.3")[0] == 0
+    words = "--set mutation-strength=0.25 --set elite_fraction=0.3 --frames 1e6"
+    assert credo(f"resume {run} {words}")[0] == 0
     assert told[0][1]["set"] == {"breeder.mutation.strength": 0.25, "breeder.elite_fraction": 0.3}
     code, _, err = credo(f"resume {run} --set mutation.strngth=0.5")
     assert code == 2
     assert "did you mean 'strength'?" in err
+
+
+def test_a_setting_of_a_finished_run_is_said_to_be_unused(credo, seeds, run, tmp_path):
+    alone = shutil.copytree(run, tmp_path / "alone")
+    for path, first in ((alone, alone), (seeds, f"{seeds}/seed-3")):
+        code, _, err = credo(f"resume {path} --set episodes=5")
+        assert code == 0
+        assert f"--set is not used: {first} is finished and trains no more; give a larger" in err
+    config = Run(alone).config
+    assert (Run(alone).algorithm.episodes, "changes" in config) == (4, False)
 
 
 def test_a_seed_or_a_budget_is_no_setting(credo, run):
@@ -818,7 +832,7 @@ def test_a_task_of_ones_own_is_trained_and_resumed(credo, own_tasks, tmp_path, m
     for command in ("resume", "evaluate", "watch"):
         code, out, err = credo(f"{command} {path}")
         assert (code, out) == (1, "")
-        assert f"names {own_tasks}:Good, which is somebody's own code" in err
+        assert f"names {own_tasks}:Good, which is code of others" in err
         assert "--trust" in err
     assert credo(f"evaluate {path} --episodes 2 --trust")[0] == 0
     for command in ("report", "export"):  # they import nothing
@@ -840,8 +854,10 @@ def test_a_run_that_ends_before_it_learns_is_mentioned(credo, tmp_path):
     assert code == 0
     assert "nothing is learned by gradient in the first 25,000 frames" in err
     assert "fewer --start-frames" in err
+    assert f"credo: no gradient update was made in {tmp_path / 'a'}: nothing is" in err
     _, _, err = credo(*words.split(), str(tmp_path / "b"), "--start-frames", "200")
     assert "nothing is learned" not in err
+    assert "no gradient update" not in err
 
 
 def test_a_task_is_checked_with_the_flags_it_is_given(credo, own_tasks):
@@ -986,7 +1002,7 @@ def test_ctrl_c_ends_a_command_without_taking_python_apart():
         "import atexit, sys\nfrom credo import cli\n"
         "atexit.register(lambda: print('taken apart'))\n"
         "def stop(argv):\n    print('begun')\n    raise KeyboardInterrupt\n"
-        "import credo.cli.list\ncredo.cli.list.run = stop\n"
+        "from credo.cli import commands\ncommands.List.__call__ = staticmethod(stop)\n"
         "sys.argv = ['credo', 'list']\ncli.main()\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)

@@ -37,6 +37,24 @@ def test_every_field_is_listed_by_the_object_that_it_is_of(capsys):
     assert "(ucb, uniform, thompson, none) [ucb]" in " ".join(out.split())
 
 
+def test_a_short_name_shows_the_defaults_of_all_its_fields(capsys):
+    out = " ".join(shown(capsys, "train", "erl", "--help").split())
+    assert "of actors and critics alike, above 0 [actor-lr 5e-05, critic-lr 0.0005]" in out
+    out = " ".join(shown(capsys, "train", "cerl", "--help-all").split())
+    assert "of actors and critics alike, above 0 [0.0003]" in out
+    assert "in [0, 1] [0.9 or 0.99 or 0.997 or 0.9995] --learning-rate" in out
+
+
+def test_without_a_task_none_of_its_flags_is_shown(capsys):
+    told = "Flags of a task are shown with it: credo train td3 TASK --help-all."
+    out = shown(capsys, "train", "td3", "--help-all")
+    assert told in " ".join(out.split())
+    assert "\nenv" not in out
+    out = shown(capsys, "train", "neuroevolution", "sequence-recall", "--help-all")
+    assert "Flags of a task are shown" not in out
+    assert "\nenv\n" in out
+
+
 def offered(algorithm: str) -> dict[str, str]:
     """Every flag of an algorithm and its text."""
     entry = names.ALGORITHMS[algorithm]

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from credo.algorithms.neuroevolution import Neuroevolution
+from credo.environments import processes
 from credo.environments.sequence_classification import SequenceClassification
 from credo.evolution.breeder import altered
-from credo.executors import local, worker
+from credo.executors import local
 from credo.networks.mmu import MMU
 from credo.runs import config, loop
 from credo.runs.options import RunOptions
@@ -112,21 +113,24 @@ def test_a_folder_with_another_run_is_refused(trained, changes, told):
 
 
 DIES_ONCE = """
-import json, os, pathlib, sys
-for line in sys.stdin:
-    job = json.loads(line)
-    if job["seed"] == 0:
-        os.kill(os.getpid(), 9)
-    print(json.dumps({"ok": job["path"]}), flush=True)
+import json, os, sys
+def main():
+    for line in sys.stdin:
+        job = json.loads(line)
+        if job["seed"] == 0:
+            os.kill(os.getpid(), 9)
+        print(json.dumps({"ok": job["path"]}), flush=True)
 """
 
 
 def test_a_process_that_dies_is_told_and_replaced(tmp_path, monkeypatch):
     started = []
+    (tmp_path / "dies_once.py").write_text(DIES_ONCE)
+    monkeypatch.syspath_prepend(str(tmp_path))
 
     def start(core):
-        command, pipe = [sys.executable, "-c", DIES_ONCE], subprocess.PIPE
-        started.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True))
+        pipe = subprocess.PIPE
+        started.append(processes.Child("dies_once", stdin=pipe, stdout=pipe, text=True))
         return started[-1]
 
     monkeypatch.setattr(local, "_start", start)
@@ -215,17 +219,15 @@ def test_a_signal_reaches_every_worker_and_each_saves(tmp_path):
         assert int(newest) == loop.Run(path).metrics["generation"][-1] >= 1
 
 
-def test_a_worker_is_told_its_path_as_json(monkeypatch, tmp_path):
+def test_a_worker_finds_modules_where_this_process_does(monkeypatch, tmp_path):
     """A folder may have a colon in its name, and a script may have added to the path."""
     folder = tmp_path / "a:b"
     folder.mkdir()
-    (folder / "mine_alone.py").write_text("")
+    (folder / "mine_alone.py").write_text("def main(): print('found')")
     monkeypatch.syspath_prepend(str(folder))
-    *start, script, path, core = worker.command(0)
-    assert json.loads(path)[0] == str(folder)
-    script = script.replace("worker.main(int(sys.argv[2]))", "import mine_alone")
-    done = subprocess.run([*start, script, path, core], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
+    child = processes.Child("mine_alone", stdout=subprocess.PIPE, text=True)
+    assert child.communicate(timeout=60) == ("found\n", None)
+    assert child.returncode == 0
 
 
 def gone(pid, seconds=20):
@@ -243,62 +245,76 @@ def gone(pid, seconds=20):
 
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-# Deaf to signals, with a child in its group; it says who they are.
-DEAF = """
+# With a child in its group; it says who they are. Told "deaf" it does not end by a signal.
+STUBBORN = """
 import os, signal, subprocess, sys, time
-signal.signal(signal.SIGINT, signal.SIG_IGN)
-child = subprocess.Popen(["sleep", "100"])
-open(sys.argv[1], "w").write(f"{os.getpid()} {child.pid} ")
-time.sleep(100)
+def main():
+    if sys.argv[2] == "deaf":
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    child = subprocess.Popen(["sleep", "100"])
+    open(sys.argv[1], "w").write(f"{os.getpid()} {child.pid} ")
+    time.sleep(100)
 """
 RUNS = """
-import sys
-from credo.executors import local, worker
+import subprocess, sys
+from credo.environments.processes import Child
+from credo.executors import local
 from credo.runs.options import RunOptions
-worker.command = lambda core: [sys.executable, "-c", sys.argv[1], sys.argv[2]]
+folder, hearing = sys.argv[1:]
+sys.path.append(folder)
+given = {"grace": 3600.0, "stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+local._start = lambda core: Child("stubborn", folder + "/told", hearing, **given)
 local.Job.finished = lambda self: False
 options = RunOptions(generations=5)
-local.run([local.Job(sys.argv[2] + "-run", {"class": "a:B"}, 0, options)], workers=1)
+local.run([local.Job(folder + "/run", {"class": "a:B"}, 0, options)], workers=1)
 """
 
 
-@linux
-def test_a_second_signal_ends_workers_that_are_deaf_to_it(tmp_path):
+@pytest.fixture
+def runs(tmp_path, request):
+    """A process that has a worker, and the numbers of this and of its child."""
+    (tmp_path / "stubborn.py").write_text(STUBBORN)
     told = tmp_path / "told"
-    process = subprocess.Popen([sys.executable, "-c", RUNS, DEAF, str(told)], stderr=-1, text=True)
+    command = [sys.executable, "-c", RUNS, str(tmp_path), request.param]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         deadline = time.monotonic() + 60
         while not (told.exists() and told.read_text().endswith(" ")):
             assert process.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
-        time.sleep(0.5)
-        assert process.poll() is None
-        process.send_signal(signal.SIGINT)
-        began = time.monotonic()
-        _, said = process.communicate(timeout=30)
-        assert time.monotonic() - began < 15
+        yield process, [int(pid) for pid in told.read_text().split()]
     finally:
         process.kill()
-        process.communicate()
-    assert process.returncode == 130, said
-    assert "credo: stopping after this generation; once more to stop at once" in said
-    assert [gone(int(pid)) for pid in told.read_text().split()] == [True, True]
+        process.wait()
+        assert process.stderr is not None
+        process.stderr.close()
 
 
 @linux
-def test_workers_end_with_a_parent_that_is_killed():
-    child = "import os; from credo.executors import worker; worker._ask_for_death(os.getppid())\n"
-    child += "print(os.getpid(), flush=True); import time; time.sleep(100)"
-    script = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
-    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
-    pid = int(parent.stdout.readline())
-    assert not gone(pid, 0.2)
-    parent.kill()
-    parent.communicate()
-    assert gone(pid)
+@pytest.mark.parametrize("runs", ["deaf"], indirect=True)
+def test_a_second_signal_ends_workers_that_are_deaf_to_it(runs):
+    process, workers = runs
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    began = time.monotonic()
+    _, said = process.communicate(timeout=30)
+    assert time.monotonic() - began < 15
+    assert process.returncode == 130, said
+    assert "credo: stopping after this generation; once more to stop at once" in said
+    assert [gone(pid) for pid in workers] == [True, True]
+
+
+@linux
+@pytest.mark.parametrize("runs", ["hearing"], indirect=True)
+def test_workers_end_with_a_parent_that_is_killed(runs):
+    process, workers = runs
+    assert not gone(workers[0], 0.2)
+    process.kill()
+    process.communicate()
+    assert [gone(pid) for pid in workers] == [True, True]
 
 
 def test_what_a_stranger_recorded_is_not_trusted_by_a_worker(tmp_path):

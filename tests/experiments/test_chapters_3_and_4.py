@@ -19,15 +19,13 @@ from credo.environments.server_fleet import ServerFleet
 from credo.environments.wrappers import NoisyObservations
 from credo.experiments import (
     base,
-    beyond_3,
     beyond_4,
+    case_study,
     catalogue,
-    fig_3_4a,
-    fig_3_9a,
-    fig_3_11,
-    fig_4_2,
-    fig_4_7,
-    table_4_1,
+    fleets,
+    gradient,
+    sequences,
+    tmazes,
 )
 from credo.experiments.base import Cell, Trained, find
 from credo.networks.dmmu import DMMU
@@ -65,33 +63,31 @@ CHOSEN = {  # of each experiment of chapter 4, the cells that are run
 }
 
 
-def sequences(task, depth, preset, trainer, algorithm, **more):
+def tiny(task, depth, preset, trainer, algorithm, **more):
     labels = {"task": task, "depth": depth, "preset": preset, "trainer": trainer, "network": "mmu"}
     return Cell({**labels, **more}, algorithm, range(2), 12)
 
 
 TINY = [
-    sequences(
+    tiny(
         "classification",
         2,
         "as written",
         "gradient",
         BPTT.as_written(SHORT, MMU(hidden=5), **TINY_BPTT),
     ),
-    sequences(
+    tiny(
         "classification",
         2,
         "as coded",
         "evolution",
         Neuroevolution.as_coded(SHORT, MMU(hidden=5), **SIZES),
     ),
-    sequences(
+    tiny(
         "classification", 2, "ours", "evolution", Neuroevolution.ours(SHORT, MMU(hidden=5), **SIZES)
     ),
-    sequences("recall", 1, "ours", "gradient", BPTT.ours(RECALL, MMU(hidden=5), **TINY_BPTT)),
-    sequences(
-        "recall", 1, "ours", "evolution", Neuroevolution.ours(RECALL, MMU(hidden=5), **SIZES)
-    ),
+    tiny("recall", 1, "ours", "gradient", BPTT.ours(RECALL, MMU(hidden=5), **TINY_BPTT)),
+    tiny("recall", 1, "ours", "evolution", Neuroevolution.ours(RECALL, MMU(hidden=5), **SIZES)),
 ]
 
 
@@ -182,7 +178,7 @@ def test_cells_of_chapter_3_are_what_their_labels_say(name, budget):
         assert cell.generations >= 10
         assert cell.seeds[0] == (200 if labels["preset"] == "ours" else 0)
         assert algorithm.env.depth == labels["depth"]
-        assert isinstance(algorithm.env, fig_3_4a.TASKS[labels["task"]])
+        assert isinstance(algorithm.env, sequences.TASKS[labels["task"]])
         assert isinstance(algorithm, BPTT) == (labels["trainer"] == "gradient")
         assert getattr(algorithm.network, "cell", "mmu") == labels["network"]
 
@@ -211,22 +207,8 @@ def test_cells_of_chapter_4_have_the_published_sizes(name):
                 assert len(algorithm.breeder.mating) == (1 if labels["network"] == "cnf" else 2)
 
 
-def test_cells_of_one_name_are_the_same_in_every_experiment():
-    """They share their runs."""
-    for budget in fig_4_2.BUDGETS:
-        seen, shared = {}, 0
-        for name in CHAPTER_3 + CHAPTER_4:
-            for cell in find(name).cells(budget) if budget in find(name).budgets else []:
-                shared += cell.name in seen
-                kept = seen.setdefault(cell.name, cell)
-                assert kept.algorithm == cell.algorithm
-                assert (kept.seeds, kept.budget) == (cell.seeds, cell.budget)
-                assert pathlib.Path(cell.folder).name == cell.folder
-        assert shared >= (20 if budget == "full" else 5)
-
-
 def test_both_trainers_have_as_many_instances_in_beyond_3():
-    for cell in beyond_3.cells("full"):
+    for cell in find("beyond-3").cells("full"):
         algorithm = cell.algorithm
         if isinstance(algorithm, BPTT):
             assert algorithm.updates * algorithm.batch_size == 1000
@@ -236,11 +218,11 @@ def test_both_trainers_have_as_many_instances_in_beyond_3():
 
 
 def test_a_cell_has_the_trainer_the_network_and_the_size_of_its_labels():
-    cell = fig_3_4a.cell("quick", "recall", 4, "as written", "gradient", "gru")
+    cell = sequences.cell("quick", "recall", 4, "as written", "gradient", "gru")
     assert cell.name == "recall, depth 4, as written, gradient, gru"
     assert cell.algorithm.network == Recurrent("gru", 20, initializer="kaiming")
     assert (cell.algorithm.env.depth, cell.algorithm.l2, cell.seeds[0]) == (4, 0.1, 0)
-    cell = fig_3_4a.cell("full", "classification", 5, "ours", memory=2)
+    cell = sequences.cell("full", "classification", 5, "ours", memory=2)
     assert cell.name == "classification, depth 5, ours, evolution, mmu, memory 2"
     network = cell.algorithm.network
     assert (network.hidden, network.cells, network.encoder) == (5, 2, "learned")
@@ -248,16 +230,16 @@ def test_a_cell_has_the_trainer_the_network_and_the_size_of_its_labels():
 
 
 def test_every_network_of_a_fleet_has_the_same_budget():
-    cells = fig_4_7.cells("published")
+    cells = fleets.cells("published")
     assert {cell.generations for cell in cells} == {15_000}
-    assert len(cells) == 2 * len(fig_4_7.networks())
+    assert len(cells) == 2 * len(fleets.networks())
     busy = [cell.algorithm.env.busy for cell in cells]
     assert np.array_equal(busy[:6], [1] * 6)
     assert busy[6:] == [(0, 2)] * 6
 
 
 def test_large_fleets_have_few_matrices_hit_whatever_their_network():
-    for cell in fig_4_7.cells("published"):
+    for cell in fleets.cells("published"):
         env, network = cell.algorithm.env, cell.algorithm.network
         matrices = len(jax.tree.leaves(network.init(*env.sizes, key=jax.random.key(0))))
         hit = cell.algorithm.breeder.mutation.probability * matrices
@@ -342,7 +324,7 @@ def test_success_is_laid_over_the_instances_of_each_trainer(of_sequences):
         ("classification, depth 2, as written, gradient, mmu", 10),
     ):
         group = of_sequences[name]
-        curves = fig_3_11.over_instances(group)
+        curves = gradient.over_instances(group)
         assert [list(curve.at) for curve in curves] == [[each * g for g in range(1, 13)]] * 2
         scores = [run.metrics["champion_score"] for run in group.runs]
         np.testing.assert_allclose([curve.values for curve in curves], scores, atol=1e-4)
@@ -351,30 +333,26 @@ def test_success_is_laid_over_the_instances_of_each_trainer(of_sequences):
 def test_weights_are_counted():
     network = Recurrent("gru", 3)
     champion = network.init(1, 1, key=jax.random.key(0))
-
-    class Stub:
-        labels = {}
-        runs = [type("Run", (), {"champion": champion})]
-
-    (row,) = beyond_3.weights(Stub())
+    run = type("Run", (), {"champion": champion})
+    (row,) = gradient.weights(Trained(Cell({}, None, [0]), [run], ""))
     assert row.value == 3 * (3 * 1 + 3 * 3 + 3) + 3 + 1
 
 
 def test_figure_3_11_has_its_four_parts_and_the_published_number():
-    gradient = fig_3_4a.cell("full", "classification", 21, "ours", "gradient").labels
-    evolution = fig_3_4a.cell("full", "classification", 21, "as coded").labels
+    by_gradient = sequences.cell("full", "classification", 21, "ours", "gradient").labels
+    evolution = sequences.cell("full", "classification", 21, "as coded").labels
     parts = []
-    for labels, success in ((gradient, [0.9, 1.0]), (evolution, [0.5, 0.7])):
+    for labels, success in ((by_gradient, [0.9, 1.0]), (evolution, [0.5, 0.7])):
         told = {"labels": labels, "seed": [200, 201]}
         parts += rows("success", success, **told)
         axis = ("success by instances", "reinforcement instances", [10_000, 20_000])
         parts += series(*axis, [[0.1, s] for s in success], **told)
-    told = {"labels": gradient, "seed": [200, 201]}
+    told = {"labels": by_gradient, "seed": [200, 201]}
     gaps = ("success by distractors", "distractors between signals", [0, 15, 101])
     parts += series(*gaps, [[1.0, 1.0, 0.5], [1.0, 0.9, 0.3]], **told)
     depths = ("success by depth", "depth of the test", [16, 21, 66, 101])
     parts += series(*depths, [[1.0, 1.0, 0.5, 0.2], [1.0, 0.9, 0.5, 0.1]], **told)
-    found = sections(made_up("fig-3.11", [gradient, evolution], *parts))
+    found = sections(made_up("fig-3.11", [by_gradient, evolution], *parts))
     for part in ("(a) ours, gradient", "(b) Gradient and evolution, depth 21", "(d) Champions"):
         assert any(title.startswith(part) for title in found)
     both = found["(b) Gradient and evolution, depth 21"]
@@ -390,7 +368,7 @@ def test_figure_3_12_compares_at_one_depth():
     for depth in (2, 4):
         for trainer, equal in (("gradient", False), ("evolution", True)):
             cells.append(
-                fig_3_4a.cell("full", "recall", depth, "ours", trainer, equal=equal).labels
+                sequences.cell("full", "recall", depth, "ours", trainer, equal=equal).labels
             )
             axis = ("success by instances", "reinforcement instances", [10_000, 20_000])
             parts += series(*axis, [[0.1, 0.9], [0.1, 1.0]], cells[-1], seed=[200, 201])
@@ -400,27 +378,28 @@ def test_figure_3_12_compares_at_one_depth():
 
 
 def test_published_values_stand_at_their_depth():
-    cells = [fig_3_4a.cell("full", "recall", depth, "ours").labels for depth in (2, 6)]
+    cells = [sequences.cell("full", "recall", depth, "ours").labels for depth in (2, 6)]
     parts = [Row(x, 200, "success", 0.5) for x in cells]
     table = sections(made_up("fig-3.9a", cells, *parts))["Success, %"]
     column = table.columns.index("published")
     assert [row[column] for row in table.rows] == ["> 45", "46.3 ± 0.9"]
-    assert fig_3_9a.DEPTHS["full"] == (1, 2, 3, 4, 5, 6)
+    depths = {cell.labels["depth"] for cell in find("fig-3.9a").cells("full")}
+    assert depths == {1, 2, 3, 4, 5, 6}
 
 
 def test_the_best_team_with_memory_is_shown_and_results_without_episodes_still_render(of_teams):
     with_memory = measured("fig-4.2", [of_teams[MAZES]])
-    walk, memory = fig_4_2.pictures(with_memory, ())
+    walk, memory = tmazes.pictures(with_memory, ())
     final = with_memory.by_seed("share of trials")
     best = max(final, key=lambda seed: final[seed])
     assert walk.title == f"An episode of {MAZES}: seed {best}, the best of 2"
     assert [len(track.rows) for track in walk.tracks] == [12, 12]
     assert np.shape(memory.values) == (3, 12)
     without = replace(with_memory, curves=[x for x in with_memory.curves if x.x != "trial"])
-    assert list(fig_4_2.pictures(without, ())) == []
+    assert list(tmazes.pictures(without, ())) == []
     assert len(sections(without)) == 3
     reactive = measured("fig-4.4", [of_teams[TEAMS]])
-    assert list(fig_4_2.pictures(reactive, ())) == []
+    assert list(tmazes.pictures(reactive, ())) == []
 
 
 def share(labels, final, baselines, kind, bound):
@@ -455,7 +434,7 @@ def test_rewards_have_tables_without_a_published_column():
 def test_a_run_is_as_good_as_the_table_in_any_order_of_the_configurations():
     labels = {"task": "case study", "network": "dmmu"}
     orders = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 0, 1]]
-    rewards, where = [[4, 5, 4, 6, 4, 5], [6, 6, 6, 6, 3, 6]], table_4_1.CONFIGURATIONS
+    rewards, where = [[4, 5, 4, 6, 4, 5], [6, 6, 6, 6, 3, 6]], case_study.CONFIGURATIONS
     axes = {"seed": [200, 201], "configuration": where}
     found = made_up(
         "table-4.1",
@@ -590,7 +569,7 @@ def test_what_leaving_costs_stands_beside_what_it_costs_others():
 
 
 def test_mazes_are_made_of_their_labels():
-    env = fig_4_2.cell("quick", "converge", 3, "mmu", partner="resp").algorithm.env
+    env = tmazes.cell("quick", "converge", 3, "mmu", partner="resp").algorithm.env
     expected = ExtendedTMaze(depth=3, objective="converge", partner="resp", shaping=True)
     assert env == expected
-    assert not fig_4_2.cell("quick", "spread", 2, "ff", robots=3).algorithm.env.shaping
+    assert not tmazes.cell("quick", "spread", 2, "ff", robots=3).algorithm.env.shaping

@@ -16,17 +16,13 @@ from credo.experiments import (
     base,
     catalogue,
     check_spread,
-    check_td3,
-    fig_5_2,
-    fig_5_3,
-    fig_5_4,
-    fig_6_5,
-    fig_7_1,
-    fig_7_4,
-    fig_7_5,
     measures,
-    note_5_5,
-    table_5_2,
+    mujoco,
+    paths,
+    pendulum,
+    portfolios,
+    rovers,
+    runtime,
 )
 from credo.experiments.base import Trained, find
 from credo.learners.manager import UCB
@@ -37,7 +33,7 @@ from credo.report import run_page
 from credo.report import sections as report
 from credo.report.rows import Results, Row, Series, concat, read, rows, series, write
 from credo.rollout import evaluate
-from credo.runs import checkpoint, config, log
+from credo.runs import checkpoint, config, files, log
 from credo.runs.store import Run
 
 CHAPTERS = ("5", "6", "td3", "learners")
@@ -57,7 +53,7 @@ def fake(path, algorithm, seed, speed=1.0, **columns):
     """A run of this algorithm that was never trained: the champion is the first draw."""
     path.mkdir(parents=True)
     record = {"algorithm": config.to_tree(algorithm), "seed": seed, "machine": config.machine()}
-    config.write_json(path / "config.json", record | {"budget": {"frames": 1}})
+    files.write_json(path / "config.json", record | {"budget": {"frames": 1}})
     g = np.arange(1, GENERATIONS + 1)
     table = {"frames": FRAMES * g, "champion_score": 10.0 * g + seed, "fitness_max": 1.0 * g}
     table["updates"] = np.full(GENERATIONS, FRAMES if getattr(algorithm, "learners", True) else 0)
@@ -85,8 +81,8 @@ def trained(tmp_path_factory):
 
     def of(cell):
         if cell.folder not in made:
-            paths = [(seed, folder / cell.folder / str(seed)) for seed in cell.seeds]
-            made[cell.folder] = [fake(path, cell.algorithm, seed) for seed, path in paths]
+            folders = [(seed, folder / cell.folder / str(seed)) for seed in cell.seeds]
+            made[cell.folder] = [fake(path, cell.algorithm, seed) for seed, path in folders]
         return Trained(cell, made[cell.folder], "smoke")
 
     return of
@@ -127,7 +123,7 @@ def test_the_check_of_td3_is_td3_as_it_comes():
 
 def test_the_double_pendulum_is_played_both_ways():
     name = "InvertedDoublePendulum-v5"
-    cells = {cell.name: cell for cell in fig_5_2.cells("full")}
+    cells = {cell.name: cell for cell in pendulum.cells("full")}
     standard = [f"{kind}, {name}" for kind in ("erl", "erl ours", "ddpg", "ea")]
     spread = f"ddpg spread, {name}, delayed"
     assert [label for label in cells if label != spread] == standard + [
@@ -163,12 +159,12 @@ def test_portfolios_differ_in_what_the_figures_say():
     explorer = cell_named("cerl, exploration 5, Humanoid-v5").algorithm
     assert explorer.manager.exploration == 5.0
     alone = cell_named("td3, gamma 0.9, Humanoid-v5").algorithm.learner
-    assert alone == fig_6_5.portfolio((0.9,))[0]
+    assert alone == portfolios.portfolio((0.9,))[0]
     assert cell_named("ea of cerl, Hopper-v5").algorithm.learners == ()
 
 
 def test_every_method_on_rovers_has_the_same_team_discount_rates_and_updates():
-    cells = [cell.algorithm for cell in fig_7_4.cells("full")]
+    cells = [cell.algorithm for cell in find("fig-7.4").cells("full")]
     assert len(cells) == 7 * 7 + 6
     learners = [x for cell in cells for x in getattr(cell, "learners", ()) or ()]
     learners += [cell.learner for cell in cells if not isinstance(cell, MERL)]
@@ -201,9 +197,9 @@ def test_its_numbers_are_plain_and_its_page_renders(name, trained, tmp_path, mon
 
 
 def test_scores_are_those_logged_and_those_of_fresh_episodes(trained):
-    cell = trained(check_td3.cells("smoke")[0])
+    cell = trained(find("check-td3").cells("smoke")[0])
     found = results_of("check-td3", cell)
-    assert found.levels("task", "method") == [(fig_5_3.STAND_IN, "td3")]
+    assert found.levels("task", "method") == [(mujoco.STAND_IN, "td3")]
     first, second = found.curves
     assert list(first.at) == list(range(20, 2001, 20))
     assert second.values[:6] == [None] * 4 + [11.0, 11.0]  # tested after 100 frames
@@ -217,30 +213,30 @@ def test_scores_are_those_logged_and_those_of_fresh_episodes(trained):
 
 
 def test_evolution_alone_makes_no_updates(trained):
-    cell = trained(fig_5_3.cell("ea", ERL.ea, fig_5_3.STAND_IN, "smoke"))
+    cell = trained(mujoco.cell("ea", ERL.ea, mujoco.STAND_IN, "smoke"))
     updates = [row.value for row in measures.effort(cell) if row.metric == "updates per frame"]
     assert updates == [0.0, 0.0]
 
 
 def test_a_pendulum_is_solved_when_its_test_says_so(tmp_path):
-    erl, _, ddpg_cell = fig_5_2.cells("smoke")[:3]
+    erl, _, ddpg_cell = pendulum.cells("smoke")[:3]
     scores = {"champion_score": np.r_[np.zeros(9), 9001.0, np.zeros(10)]}
     solved = [fake(tmp_path / "a", erl.algorithm, 0, **scores)]
     failed = [fake(tmp_path / "b", ddpg_cell.algorithm, 0, champion_score=np.full(20, 8999.0))]
     cells = [Trained(erl, solved, ""), Trained(ddpg_cell, failed, "")]
-    first = measures.first("solved after", fig_5_2.SOLVED, "episodes")
+    first = measures.first("solved after", pendulum.SOLVED, "episodes")
     cells[0].cell.__dict__["seeds"] = cells[1].cell.__dict__["seeds"] = [0]
-    found = [row for cell in cells for row in [*first(cell), *fig_5_2.played(cell)]]
+    found = [row for cell in cells for row in [*first(cell), *pendulum.played(cell)]]
     assert [row.value for row in found] == [110, 220, None, 20]  # 11 episodes a generation
     results = Results("fig-5.2", "smoke", "", [cell.cell.record() for cell in cells], found, [])
-    (table,) = fig_5_2.EPISODES(results, fig_5_2.EXPERIMENT.values)
+    (table,) = pendulum.EPISODES(results, find("fig-5.2").values)
     published = [row[2] for row in table.rows]
     assert published == ["< 3,000", "< 3,000"]
     assert [row[3:5] for row in table.rows] == [["1 of 1", "110"], ["0 of 1", "not in 20"]]
 
 
 def test_fates_stand_beside_the_published_ones_and_chance(trained):
-    cell = trained(table_5_2.cells("smoke")[0])
+    cell = trained(find("table-5.2").cells("smoke")[0])
     found = results_of("table-5.2", cell)
     assert found.by_seed("injected") == {0: [20], 1: [20]}
     assert found.by_seed("fate") == {0: [0.5, 0.25, 0.25], 1: [0.5, 0.25, 0.25]}
@@ -255,15 +251,15 @@ def test_fates_stand_beside_the_published_ones_and_chance(trained):
     assert sum(expected) == pytest.approx(1.0, abs=1e-3)
     table = next(iter(sections_of(found).values()))
     assert [row[1:3] for row in table.rows] == [
-        [fate, 100 * x] for fate, x in zip(table_5_2.FATES, expected, strict=True)
+        [fate, 100 * x] for fate, x in zip(mujoco.FATES, expected, strict=True)
     ]
     hopper = {"task": "Hopper-v5", "fate": "elite"}
-    (value,) = [x for x in table_5_2.EXPERIMENT.values if dict(x.labels) == hopper]
+    (value,) = [x for x in find("table-5.2").values if dict(x.labels) == hopper]
     assert value.value == "28.7 ± 8.5"
 
 
 def test_extra_time_is_that_of_the_clock(tmp_path):
-    cells = note_5_5.cells("smoke")
+    cells = runtime.cells("smoke")
     runs = [
         [fake(tmp_path / f"{speed}{seed}", cell.algorithm, seed, speed=speed) for seed in (0, 1)]
         for cell, speed in zip(cells, (0.8, 1.0), strict=True)
@@ -273,46 +269,46 @@ def test_extra_time_is_that_of_the_clock(tmp_path):
     assert per_frame == {0: [pytest.approx(12.5)], 1: [pytest.approx(12.5)]}
     assert found.where(method="ddpg").by_seed("seconds per 1000 frames")[0] == [pytest.approx(10.0)]
     assert found.by_seed("updates per frame")[0] == [pytest.approx(1.0)] * 2
-    (table,) = note_5_5.extra(found, ())
+    (table,) = runtime.extra(found, ())
     published, measured = table.rows[0]
     assert published == "+3"
     assert list(measured.values) == pytest.approx([25.0, 25.0])
 
 
 def test_hours_are_those_of_the_clock(trained):
-    cell = trained(check_td3.cells("smoke")[0])
+    cell = trained(find("check-td3").cells("smoke")[0])
     assert cell.record()["hours"] == round(2 * 24 / 3600, 2)
     assert set(cell.record()) == {"labels", "seeds", "budget", "algorithm", "machine", "hours"}
 
 
 def test_a_report_shows_attribution_where_there_is_any(trained, tmp_path):
-    cells = [fig_6_5.cerl(fig_5_3.STAND_IN, "smoke"), check_td3.cells("smoke")[0]]
-    paths = [run.path for cell in cells for run in trained(cell).runs]
-    html = run_page.write(paths, tmp_path / "report.html").read_text()
+    cells = [portfolios.cerl(mujoco.STAND_IN, "smoke"), find("check-td3").cells("smoke")[0]]
+    folders = [run.path for cell in cells for run in trained(cell).runs]
+    html = run_page.write(folders, tmp_path / "report.html").read_text()
     # One portfolio: two lines of figures and one table of learners.
     for title in ("Who was the last to change", "s weights come from", "Workers of"):
         assert html.count(f"{title}") >= 1
     assert html.count("Learners: their workers") >= 1
     assert "TD3 γ 0.9995" in html
     assert "learners.3.gamma" in html  # of the settings
-    alone = run_page.write(paths[2:], tmp_path / "alone.html").read_text()
+    alone = run_page.write(folders[2:], tmp_path / "alone.html").read_text()
     assert "Learners: their workers" not in alone
 
 
 def test_learners_are_named_by_kind_and_discount():
-    learners = (*fig_6_5.portfolio((0.9, 0.9)), SAC(), ddpg())
+    learners = (*portfolios.portfolio((0.9, 0.9)), SAC(), ddpg())
     names = ["TD3 γ 0.9 (1)", "TD3 γ 0.9 (2)", "SAC γ 0.99", "DDPG γ 0.99"]
     assert run_page.learner_names(learners) == names
 
 
 def test_allocation_stands_beside_the_published_one(trained):
-    found = results_of("table-6.1", trained(fig_6_5.cerl(fig_5_3.STAND_IN, "smoke")))
+    found = results_of("table-6.1", trained(portfolios.cerl(mujoco.STAND_IN, "smoke")))
     shown = sections_of(found)
     table = next(x for title, x in shown.items() if title.startswith("Cumulative allocation"))
-    assert [row[2] for row in table.rows] == [f"TD3 γ {g:g}" for g in fig_6_5.PORTFOLIO]
+    assert [row[2] for row in table.rows] == [f"TD3 γ {g:g}" for g in portfolios.PORTFOLIO]
     assert [list(row[3].values) for row in table.rows] == [[x] * 2 for x in (0.1, 0.2, 0.3, 0.4)]
     real = [Row({**row.labels, "task": "Hopper-v5"}, *row[1:]) for row in found.rows]
-    (table,) = fig_6_5.ALLOCATION(Results("", "", "", [], real, []), find("table-6.1").values)
+    (table,) = portfolios.ALLOCATION(Results("", "", "", [], real, []), find("table-6.1").values)
     column = table.columns.index("published")
     assert [row[column] for row in table.rows] == [14.0, 27.0, 32.0, 27.0]
     made = {curve.labels["operator"] for curve in found.curves if curve.metric == "last changed by"}
@@ -324,14 +320,14 @@ def test_allocation_stands_beside_the_published_one(trained):
 
 def test_what_is_lost_without_selection():
     found = []
-    for method, last in ((fig_5_4.WITH, [110.0, 90.0]), (fig_5_4.WITHOUT, [30.0, 30.0])):
+    for method, last in ((mujoco.WITH, [110.0, 90.0]), (mujoco.WITHOUT, [30.0, 30.0])):
         labels = {"method": method, "task": "Swimmer-v5"}
         found += series(
             "test score", "frames", [1, 2], [[50.0, x] for x in last], labels, seed=[0, 1]
         )
         found += rows("random", 10.0, labels)
     known, curves = concat([found])
-    (table,) = fig_5_4.ablation(Results("", "", "", [], known, curves), ())
+    (table,) = mujoco.ablation(Results("", "", "", [], known, curves), ())
     assert table.rows == [["Swimmer-v5", 90.0, 20.0, "~ -80 %", "-78 %"]]
 
 
@@ -340,7 +336,7 @@ def test_what_is_lost_without_selection():
 
 def made_up(method, coupling=4, **metrics):
     labels = {"method": method, "coupling": coupling}
-    values = {fig_7_4.SHARE: [0.3, 0.4, 0.5], "frames": [300] * 3, "updates per frame": [0.05] * 3}
+    values = {rovers.SHARE: [0.3, 0.4, 0.5], "frames": [300] * 3, "updates per frame": [0.05] * 3}
     found: list[Row | Series] = []
     for metric, by_seed in (values | metrics).items():
         found += rows(metric, by_seed, labels, seed=[0, 1, 2])
@@ -357,7 +353,7 @@ def results_made_up(name, *parts):
 
 def test_the_table_shows_baselines_published_ours_and_bound():
     results = results_made_up("fig-7.4", made_up("merl"))
-    (table,) = fig_7_4.table("coupling", "dynamics", "method")(results, find("fig-7.4").values)
+    (table,) = rovers.table("coupling", "dynamics", "method")(results, find("fig-7.4").values)
     (row,) = table.rows
     shown = dict(zip(table.columns, row, strict=True))
     assert list(shown.pop("final champion").values) == [0.3, 0.4, 0.5]
@@ -373,7 +369,7 @@ def test_the_table_shows_baselines_published_ours_and_bound():
         "frames": 300.0,
         "updates per frame": pytest.approx(0.05),
     }
-    (figure,) = fig_7_4.curves("coupling", "dynamics")(results, ())
+    (figure,) = rovers.curves("coupling", "dynamics")(results, ())
     assert [reference.label for reference in figure.references] == ["random", "greedy script"]
 
 
@@ -388,13 +384,13 @@ def test_pages_of_rovers_have_their_sections():
     expected = {"merl": "1 (4 of 5)", "ea": 0.5, "td3 mixed": 0.5, "td3 global": 0.0}
     for method, value in expected.items():
         here = results_made_up("fig-7.1", made_up(method))
-        (table,) = fig_7_4.table("method")(here, fig_7_1.EXPERIMENT.values)
+        (table,) = rovers.table("method")(here, find("fig-7.1").values)
         assert dict(zip(table.columns, table.rows[0], strict=True))["published"] == value
 
 
 def test_paths_are_drawn_as_they_were_measured(trained):
-    cell = trained(fig_7_5.cells("smoke")[1])
-    found, curves = concat([fig_7_5.paths(cell)])
+    cell = trained(paths.cells("smoke")[1])
+    found, curves = concat([paths.paths(cell)])
     env = cell.env
     assert len(curves) == 2 * env.agents
     assert {len(curve.at) for curve in curves} == {env.max_steps + 1}
@@ -402,7 +398,7 @@ def test_paths_are_drawn_as_they_were_measured(trained):
     assert len(poi) == 2 * 4
     assert all(0 <= x <= env.size for x in poi)
     results = Results("", "", "", [cell.cell.record()], found, curves)
-    (drawing,) = fig_7_5.drawings(results, ())
+    (drawing,) = paths.drawings(results, ())
     assert isinstance(drawing, report.Drawing)
     assert drawing.title == "merl, coupling 3"
     assert f"paths of {env.agents} rovers" in drawing.light

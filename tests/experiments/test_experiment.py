@@ -1,5 +1,6 @@
 """What every experiment shares: cells by their labels, `--only`, what earlier commands measured."""
 
+import importlib
 import json
 import pathlib
 from dataclasses import replace
@@ -9,7 +10,7 @@ import pytest
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.sequence_classification import SequenceClassification
 from credo.executors import local
-from credo.experiments import base, catalogue, fig_7_4
+from credo.experiments import base, catalogue
 from credo.experiments.base import Cell, Experiment, Trained, Value, grid, named
 from credo.experiments.views import Curves, Table, mean, published
 from credo.networks.mmu import MMU
@@ -43,10 +44,10 @@ def measure(cell):
 
 TABLE = Table("Return", ["depth"], {"return": mean("return"), "published": published("return")})
 EXPERIMENT = Experiment(
-    published="A text.",
     cells=lambda budget: CELLS,
     measures=(measure,),
     views=(TABLE, Curves("score", "frames", ["depth"])),
+    published="A text.",
     values=(Value(3.0, "return", "a paper", {"depth": 5}),),
 )
 
@@ -84,8 +85,13 @@ def test_a_grid_has_every_combination():
 
 def test_the_catalogue_has_every_module():
     folder = pathlib.Path(base.__file__).parent
-    modules = {path.stem for path in folder.glob("*.py") if "EXPERIMENT = " in path.read_text()}
-    assert modules - {"base"} == {catalogue.module(name) for name in catalogue.EXPERIMENTS}
+    modules = {path.stem for path in folder.glob("*.py") if "\nEXPERIMENTS = " in path.read_text()}
+    assert modules - {"catalogue"} == set(catalogue.MODULES)
+    for module, names in catalogue.MODULES.items():
+        found = importlib.import_module(f"credo.experiments.{module}").EXPERIMENTS
+        assert set(found) == set(names)
+    every = [name for names in catalogue.MODULES.values() for name in names]
+    assert sorted(every) == sorted(catalogue.EXPERIMENTS)
 
 
 @pytest.mark.parametrize("budget", ["smoke", "quick", "full", "million", "published"])
@@ -104,7 +110,7 @@ def test_cells_of_one_name_are_the_same_in_every_experiment(budget):
 
 
 def test_only_matches_what_a_reader_sees():
-    cells = fig_7_4.cells("full")
+    cells = base.find("fig-7.4").cells("full")
     (found,) = base.matching(cells, "^merl, coupling 4$", "fig-7.4")
     assert found.labels == {"method": "merl", "coupling": 4}
     assert len(base.matching(cells, "MERL, COUPLING 4", "fig-7.4")) == 3

@@ -1,12 +1,15 @@
 """Views of rows, against sections made by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from credo.experiments.base import Value, grid
+from credo.experiments.base import Experiment, Value, grid
+from credo.experiments.base import sections as sections_of
 from credo.experiments.views import (
+    SEED,
     Curves,
-    Notes,
     Table,
     count,
     each,
@@ -14,7 +17,6 @@ from credo.experiments.views import (
     mean,
     plain,
     published,
-    where,
 )
 from credo.report import sections
 from credo.report.rows import Results, rows, series
@@ -71,10 +73,10 @@ def test_a_table_has_a_row_for_each_combination(results):
     assert table.rows[0][-1] == "~5"
 
 
-def test_a_published_number_is_a_level_or_has_its_source(results):
+def test_a_published_number_is_a_level_or_has_its_spread(results):
     here = results.where(task="B")
     assert published("return", number=True)(here, VALUES) == 4702.0
-    assert published("return", sourced=True)(here, VALUES) == "4,702 ± 356.5 (Figure 1)"
+    assert published("return")(here, VALUES) == "4,702 ± 356.5"
     assert published("return")(here.where(method="ea"), VALUES) is None
     assert published("return", method="erl")(results.where(task="A"), VALUES) == "~5"
 
@@ -105,13 +107,22 @@ def test_curves_over_a_label_have_a_point_for_each_of_its_numbers():
         for depth, values in ((5, [0.1, 0.2]), (2, [0.3, None]))
         for row in rows("success", values, {"depth": depth}, seed=[0, 1])
     ]
-    (figure,) = Curves("success", "depth", [], scale=100)(Results("x", "", "", [], found, []), ())
+    (figure,) = Curves("success", "depth", [])(Results("x", "", "", [], found, []), ())
     (curve,) = figure.curves
     assert list(curve.x) == [2, 5]
-    np.testing.assert_allclose(curve.runs, [[30, 10], [np.nan, 20]])
+    np.testing.assert_allclose(curve.runs, [[0.3, 0.1], [np.nan, 0.2]])
 
 
 def test_notes_say_what_is_true_of_the_page(results):
-    notes = Notes(["always", where("of A", task="A"), where("of C", task="C")])
-    (text,) = notes(results, ())
-    assert text.paragraphs == ["always", "of A"]
+    notes = [("always", {}), ("of A", {"task": "A"}), ("of C", {"task": ["C", "D"]})]
+    experiment = Experiment(lambda budget: [], (), (), notes=notes)
+    (text,) = sections_of(experiment, results)
+    assert (text.title, text.paragraphs) == ("How to read it", ["always", "of A"])
+    assert sections_of(replace(experiment, notes=notes[2:]), results) == []
+
+
+def test_a_table_has_a_row_for_each_run_and_a_panel_for_each_label(results):
+    view = Table("{panel}", [SEED], {"return": each("return")}, panel=["task", "method"])
+    first, *others = view(results, ())
+    assert (first.title, len(others)) == ("A, erl", 3)
+    assert first.rows == [["3", "0.0, 1.0"], ["4", "2.0, 3.0"], ["5", "4.0, 5.0"]]

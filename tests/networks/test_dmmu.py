@@ -257,7 +257,7 @@ def test_wrong_agents_are_named():
         policy.without([3])
     with pytest.raises(ValueError, match="no agent -1"):
         policy.with_clones([-1])
-    with pytest.raises(ValueError, match="nobody is left"):
+    with pytest.raises(ValueError, match="no agent is left"):
         policy.without([0, 1, 2])
     with pytest.raises(ValueError, match="3 sizes for 2 agents"):
         UNEQUAL.init(OBS, ACT, 2, key=KEY)

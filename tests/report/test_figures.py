@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from samples import figure, heat_map, tracks
 
-from credo.analysis.statistics import bootstrap_interval, interquartile_mean
+from credo.analysis.statistics import bootstrap_interval
 from credo.report import figures, styles
 from credo.report.sections import Curve, Reference
 from credo.report.styles import Look
 
 
 def svg(item, dark=False) -> str:
-    return figures.picture(item, dark).svg
+    return figures.picture(item, styles.DARK if dark else styles.LIGHT).svg
 
 
 def test_text_of_a_figure_is_text_in_a_generic_font():
@@ -39,23 +39,22 @@ def test_dark_and_light_differ_in_colour_alone():
 
 
 def drawn(item, dark=False):
-    with matplotlib.rc_context(styles.STYLE):
-        canvas = figures.draw(item, styles.DARK if dark else styles.LIGHT)
+    theme = styles.DARK if dark else styles.LIGHT
+    with matplotlib.rc_context(theme.rc):
+        canvas = figures.draw(item, theme)
         canvas.draw_without_rendering()
     return canvas
 
 
-@pytest.mark.parametrize("centre", ["mean", "median", "iqm"])
-def test_figure_draws_every_seed_the_centre_and_its_interval(centre):
+def test_figure_draws_every_seed_the_mean_and_its_interval():
     runs = np.random.default_rng(1).random((5, 12))
-    axes = drawn(figure(curves=[Curve("a", np.arange(12), runs)], centre=centre)).axes[0]
+    axes = drawn(figure(curves=[Curve("a", np.arange(12), runs)])).axes[0]
     *seeds, thick, baseline, bound = [line.get_ydata() for line in axes.lines]
     np.testing.assert_array_equal(seeds, runs)
-    statistic = {"mean": np.mean, "median": np.median, "iqm": interquartile_mean}[centre]
-    np.testing.assert_array_equal(thick, statistic(runs, axis=0))
+    np.testing.assert_array_equal(thick, runs.mean(axis=0))
     assert set(baseline) == {0.25}
     assert set(bound) == {1.0}
-    low, high = bootstrap_interval(runs, statistic, resamples=figures.RESAMPLES)
+    low, high = bootstrap_interval(runs, resamples=figures.RESAMPLES)
     band = axes.collections[0].get_paths()[0].vertices
     for x in range(12):
         assert {low[x], high[x]} == set(band[band[:, 0] == x, 1])
@@ -131,14 +130,14 @@ def test_methods_that_are_compared_differ_in_colour():
 
 def test_looks_of_a_page_are_those_of_its_figures():
     looks = {"depth 2": Look(5, 1), "depth 3": Look(3, 0)}
-    with matplotlib.rc_context(styles.STYLE):
+    with matplotlib.rc_context(styles.LIGHT.rc):
         lines = figures.draw(figure(), styles.LIGHT, looks).axes[0].lines
     assert [lines[i].get_color() for i in (4, 9)] == [styles.LIGHT.curves[i] for i in (5, 3)]
 
 
 def test_tips_tell_values_and_where_the_axes_are():
     item = figure(curves=[Curve("a", [1, 2], [[0.0, -0.5], [1.0, np.nan]])])
-    tips = figures.picture(item).tips
+    tips = figures.picture(item, styles.LIGHT).tips
     assert tips["curves"][0]["x"] == [1.0, 2.0]
     assert tips["curves"][0]["text"] == ["0.5 [0, 1]", ""]
     left, top, width, height = tips["box"]
@@ -147,7 +146,7 @@ def test_tips_tell_values_and_where_the_axes_are():
     low, high = tips["x"]
     assert low < 1
     assert high > 2
-    cells = figures.picture(heat_map()).tips
+    cells = figures.picture(heat_map(), styles.LIGHT).tips
     assert (cells["rows"][0], cells["columns"][1]) == ("cell a", "step 2")
     assert cells["values"][0][:2] == ["-1", "-0.7857"]
 
@@ -155,29 +154,28 @@ def test_tips_tell_values_and_where_the_axes_are():
 def test_a_curve_ends_where_a_seed_has_no_value():
     runs = np.ones((2, 4))
     runs[1, 2:] = np.nan, np.inf
-    curve = figures.sampled(Curve("a", np.arange(4), runs), "mean", False, 400)
+    curve = figures.sampled(Curve("a", np.arange(4), runs), 400)
     assert np.isnan(curve.centre).tolist() == [False, False, True, True]
     assert np.isnan(curve.low).tolist() == [False, False, True, True]
     assert curve.runs[0].tolist() == [1.0] * 4
 
 
-@pytest.mark.parametrize("log_x", [False, True])
-def test_long_curves_are_picked_from_and_not_smoothed(log_x):
+def test_long_curves_are_picked_from_and_not_smoothed():
     x = np.arange(1.0, 15_001.0)
     runs = np.random.default_rng(2).random((2, 15_000))
-    curve = figures.sampled(Curve("a", x, runs), "mean", log_x, 400)
+    curve = figures.sampled(Curve("a", x, runs), 400)
     assert 200 < len(curve.x) <= 400
     assert (curve.x[0], curve.x[-1]) == (1.0, 15_000.0)
     np.testing.assert_array_equal(curve.runs, runs[:, curve.x.astype(int) - 1])
-    gaps = np.diff(np.log(curve.x[-100:]) if log_x else curve.x)
+    gaps = np.diff(curve.x)
     assert gaps.max() < 1.1 * gaps.min()
 
 
 def test_note_says_what_is_drawn():
     long = Curve("a", np.arange(15_000), np.random.default_rng(0).random((60, 15_000)))
     other = Curve("b", long.x, np.asarray(long.runs) + 1)
-    assert figures.note(figure(curves=[long, other], centre="iqm")) == (
-        "Interquartile mean over 60 runs. Band: its 95 % bootstrap interval. Thin lines: each run. "
+    assert figures.note(figure(curves=[long, other])) == (
+        "Mean over 60 runs. Band: its 95 % bootstrap interval. Thin lines: each run. "
         "Up to 40 of 15,000 points are drawn, unsmoothed."
     )
     assert figures.note(figure(curves=[Curve("a", [0, 1], [[0, 1]])])) == "One run per line."
@@ -221,15 +219,8 @@ def test_labels_move_no_further_than_they_must():
     np.testing.assert_allclose(figures.spread_out([0.98, 1.0], [0.1, 0.1]), [0.85, 0.95])
 
 
-@pytest.mark.parametrize(
-    ("last", "labels"), [(1e6, ["1", "100", "10k", "1M"]), (100.0, ["1", "2", "5", "10", "100"])]
-)
-def test_a_logarithmic_axis_has_labels_over_any_range(last, labels):
-    x = np.geomspace(1, last, 9)
-    item = figure(curves=[Curve("", x, x[None])], log_x=True, references=())
-    canvas = drawn(item)
-    assert canvas.legends == []
-    assert set(labels) <= {label.get_text() for label in canvas.axes[0].get_xticklabels()}
+def test_curves_without_a_name_have_no_legend():
+    assert drawn(figure(curves=[Curve("", [1, 2], [[0, 1]])])).legends == []
 
 
 def test_given_range_is_widened_for_the_references():

@@ -15,7 +15,7 @@ from credo.networks.mmu import MMU
 from credo.networks.team import Team
 from credo.report import mazes
 from credo.report.watch import watch
-from credo.runs import checkpoint, config
+from credo.runs import checkpoint, config, files
 from credo.runs.record import RunError
 from credo.runs.store import Run
 
@@ -33,7 +33,7 @@ def made(path, env=ENV) -> Run:
     path.mkdir()
     algorithm = CCEA.ccea(env, NETWORK, population_size=10, elite_fraction=0.1)
     checkpoint.export_policy(path / "champion.safetensors", champion(env))
-    config.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
+    files.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
     return Run(path)
 
 

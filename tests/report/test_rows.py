@@ -64,7 +64,6 @@ def test_questions_of_results():
         Row({"task": "A"}, None, "bound", 7),
     ]
     results = made(found, cells=[{"labels": {"task": "A"}}, {"labels": {"task": "B"}}])
-    assert results.metrics() == ["a", "bound"]
     assert results.levels("task") == ["A", "B"]
     assert results.levels("task", "depth") == [("A", 2), ("A", 5)]
     assert len(results.where(task=("A", "B"), depth=(2, 5)).rows) == 4

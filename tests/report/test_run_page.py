@@ -25,7 +25,7 @@ from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.report import run_page as report
 from credo.report.sections import Page
-from credo.runs import config, evaluation, log
+from credo.runs import config, evaluation, files, log
 from credo.runs.loop import train
 from credo.runs.record import RunError
 from credo.runs.store import Run
@@ -40,7 +40,7 @@ def fake(path, algorithm, seed, scores, frames=None):
     path.mkdir(parents=True)
     record = {"algorithm": config.to_tree(algorithm), "seed": seed, "machine": config.machine()}
     record |= {"budget": {"frames": 1000}} if frames else {}
-    config.write_json(path / "config.json", record)
+    files.write_json(path / "config.json", record)
     rows = [
         {
             "generation": g + 1,
@@ -222,12 +222,12 @@ def test_a_champion_is_described_by_every_signal_of_its_task(run):
     lines = evaluation.describe(run, TASK, 50, 0)[0]
     assert lines[0] == f"{run.path}: 50 fresh episodes, mean ± standard error over episodes"
     names = [line.split()[0] for line in lines[1:]]
-    assert names == [*TASK.signals, "steps", "floor"]
+    assert names == [*TASK.signals, "steps", "baseline", "upper"]
     success = float(lines[3].split()[1])
     assert 50 * success == pytest.approx(round(50 * success))
     assert lines == evaluation.describe(run, TASK, 50, 0)[0]
-    assert "floor            0.75 (" in lines[-1]
-    assert lines[-1].endswith("ceiling 1")
+    assert "baseline         0.75 (" in lines[-2]
+    assert lines[-1] == "  upper bound      1"
 
 
 def test_one_episode_has_no_standard_error(run):

@@ -34,7 +34,7 @@ from credo.networks.team import Team
 from credo.report import trajectories, viewer
 from credo.report.watch import watch
 from credo.rollout import record
-from credo.runs import checkpoint, config
+from credo.runs import checkpoint, config, files
 from credo.runs.record import RunError
 from credo.runs.store import Run
 
@@ -89,7 +89,7 @@ def made(path, env=ENV) -> Run:
     algorithm = MERL(env, NETWORK, learners=(), population_size=10)
     policy = NETWORK.init(*env.sizes, key=jax.random.key(7))
     checkpoint.export_policy(path / "champion.safetensors", policy)
-    config.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
+    files.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
     return Run(path)
 
 

@@ -25,9 +25,9 @@ from credo.environments.wrappers import DelayedHostReward, DelayedReward
 from credo.networks.mlp import MLP
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team
-from credo.report.films import _maker, _takes, film
+from credo.report.films import film
 from credo.report.watch import watch
-from credo.runs import checkpoint, config
+from credo.runs import checkpoint, config, files
 from credo.runs.record import RunError
 from credo.runs.store import Run
 from credo.types import TimeStep
@@ -119,7 +119,7 @@ def made(path, env, network=None) -> Run:
     algorithm = Neuroevolution(env, network, population_size=10)
     policy = network.init(*env.sizes, key=jax.random.key(0))
     checkpoint.export_policy(path / "champion.safetensors", policy)
-    config.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
+    files.write_json(path / "config.json", {"algorithm": config.to_tree(algorithm), "seed": 0})
     return Run(path, trust=True)
 
 
@@ -251,17 +251,6 @@ def test_a_picture_with_an_alpha_channel_is_laid_on_white(tmp_path):
     )
 
 
-def test_what_makes_an_environment_is_asked_for_its_arguments():
-    env = gymnasium.wrappers.TimeLimit(Painter(), 3)
-    assert _maker("test_watch:factory", env) is factory
-    assert _maker("test_watch:Wrapped", env) is Wrapped
-    assert _maker("nobody:knows", env) is Painter
-    cases = [(factory, True), (Wrapped, False), (Handed, True), (Fixed, True), (Painter, True)]
-    for maker, takes in cases:
-        assert _takes(maker, Painter, "render_mode") == takes
-    assert not _takes(Fixed, Fixed, "width")
-
-
 class Crew(AbstractEnvironment):
     """Two agents in JAX; a picture shows the step, and what each of them did last."""
 
@@ -367,9 +356,12 @@ def test_a_team_of_pettingzoo_is_drawn(tmp_path):
 @pytest.mark.parametrize(
     ("env", "told"),
     [
-        (task("Wrapped"), r"its class Wrapped must take render_mode.*names \['rgb_array'\]"),
-        (task("Picky"), r"its class Picky must take render_mode"),
-        (crew("Shy"), r"its class Shy must take render_mode"),
+        (
+            task("Wrapped"),
+            r"Wrapped cannot be drawn: for that it must take render_mode.*it names \['rgb_array'\]",
+        ),
+        (task("Picky"), r"Picky cannot be drawn: for that it must take render_mode"),
+        (crew("Shy"), r"Shy cannot be drawn: for that it must take render_mode"),
         (task("Blind"), r"must take render_mode.*it names \['human'\]"),
         (task(raises="no screen"), r"RuntimeError: no screen\): install what it names, or mend"),
         (task(dtype="float32"), "dtype float32: its render"),

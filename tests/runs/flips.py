@@ -75,7 +75,7 @@ def numbers(tree) -> str:
 def read(run: pathlib.Path) -> dict[str, object]:
     """All that a run says, as `report`, `evaluate`, `resume` and a policy's user read it."""
     here = loop.Run(run)
-    saved = loop._load(here, loop.fitted(here.algorithm, loop.Budget.read(here.config["budget"])))
+    saved = loop._load(here, loop.fitted(here.algorithm, loop.Budget(**here.config["budget"])))
     runner = Runner.load(run / POLICY)
     obs = np.linspace(-1.0, 1.0, runner.obs_size)
     return {

@@ -17,7 +17,7 @@ from credo.environments.sequence_recall import SequenceRecall
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
-from credo.runs import config
+from credo.runs import config, files
 
 NETWORKS = [MMU(hidden=3), Recurrent(cell="lstm"), MLP()]
 
@@ -133,10 +133,10 @@ def test_the_machine_is_recorded_as_json():
 
 def test_a_json_file_is_replaced_whole_or_not_at_all(tmp_path):
     path = tmp_path / "config.json"
-    config.write_json(path, {"a": 1, "σ": "ψ"})
+    files.write_json(path, {"a": 1, "σ": "ψ"})
     assert json.loads(path.read_text()) == {"a": 1, "σ": "ψ"}
     with pytest.raises(TypeError):
-        config.write_json(path, {"a": print})
+        files.write_json(path, {"a": print})
     assert json.loads(path.read_text()) == {"a": 1, "σ": "ψ"}
 
 

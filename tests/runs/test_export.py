@@ -16,22 +16,23 @@ from credo.environments.sequence_recall import SequenceRecall
 from credo.environments.simple_spread import SimpleSpread
 from credo.environments.wrappers import DelayedHostReward
 from credo.networks.base import ACTIVATIONS, AbstractNetwork, AbstractPolicy
-from credo.networks.dmmu import DMMU, ORDERS
-from credo.networks.mlp import MLP, NORMALIZATIONS
+from credo.networks.dmmu import DMMU
+from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.networks.normalized import Normalized
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Centralized, Team
 from credo.runner import DESCRIPTION, VERSION, Runner
-from credo.runs import checkpoint, config
+from credo.runs import checkpoint, config, files
 from credo.runs.export import export, parts_of
 from credo.runs.policy import Policy
 from credo.runs.record import RunError
 from credo.runs.store import Run
 
 STEPS = 60
+ORDERS = ("sequential", "simultaneous")
 NETWORKS = [
-    *(MLP((6, 5), a, n) for a in ACTIVATIONS for n in NORMALIZATIONS),
+    *(MLP((6, 5), a, n) for a in ACTIVATIONS for n in ("none", "before", "after")),
     MLP((), output_activation="sigmoid"),
     MLP((4,), "relu", "before", "sigmoid", initializer="uniform"),
     MMU(4),
@@ -49,7 +50,7 @@ TEAMS = [
     *(Team((5,), head, sharing) for head in HEADS for sharing in ("trunk", "nothing")),
     *(Team((5, 4), head, "everything", "relu") for head in HEADS[:2]),
     Team((), MMU(3), "nothing"),  # what CCEA drafts
-    *(DMMU(cell, 4, order=order) for cell in ("mmu", "lstm", "gru", "rnn") for order in ORDERS[:2]),
+    *(DMMU(cell, 4, order=order) for cell in ("mmu", "lstm", "gru", "rnn") for order in ORDERS),
     *(DMMU(cell, 4, access=a) for cell in ("mmu", "gru") for a in ("everyone", "acting")),
     DMMU("mmu", (3, 4, 5), 4),
     *(Centralized(network) for network in (MLP((6,)), MMU(4), Recurrent("rnn", 4))),
@@ -91,7 +92,7 @@ def made(path, env, network, seed=0, action=None, champion=None, **settings) -> 
     task = {name: getattr(env, name) for name in ("obs_size", "action_size", "agents", "discrete")}
     task["actions"] = action and adapters._described(action)
     record = {"algorithm": config.to_tree(algorithm), "seed": seed, "task": task}
-    config.write_json(path / "config.json", record)
+    files.write_json(path / "config.json", record)
     return Run(path, trust=True)
 
 

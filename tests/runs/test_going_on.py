@@ -17,8 +17,7 @@ from credo.algorithms.off_policy import OffPolicy
 from credo.environments.probes import Copy
 from credo.learners.td3 import TD3
 from credo.networks.mlp import MLP, Critic
-from credo.replay import Replay
-from credo.runs import checkpoint, config, loop, weights
+from credo.runs import checkpoint, config, loop, segments, weights
 from credo.runs.budget import Budget, fitted
 from credo.runs.checkpoint import CheckpointError, DamagedCheckpoint
 
@@ -143,7 +142,7 @@ def test_a_setting_that_makes_generations_longer_has_its_buffer(bounded, tmp_pat
     run = resume(tmp_path / "run", set={"episodes": 40}, generations=4)
     frames = int(run.metrics["frames"][-1])
     fit = loop.fitted(run.algorithm, loop.Budget(10))
-    (buffer,) = loop._buffers(loop._load(run, fit).state)
+    ((_, buffer),) = segments.buffers(loop._load(run, fit).state)
     assert int(buffer.written) == int(buffer.size) == frames  # nothing was overwritten
     assert resume(tmp_path / "run", generations=6).metrics["generation"][-1] == 6
 
@@ -351,7 +350,7 @@ def test_a_task_that_is_not_found_says_where_it_began(tmp_path, monkeypatch):
 def test_buffers_are_found_in_a_state():
     with loop.shapes_alone():
         like = eqx.filter_eval_shape(ALGORITHM.init, key=jax.random.key(0))
-    assert [type(buffer) for buffer in loop._buffers(like)] == [Replay]
+    assert len(segments.buffers(like)) == 1
 
 
 def test_the_seals_hold_nothing_random(straight, tmp_path):

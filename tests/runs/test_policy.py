@@ -18,7 +18,7 @@ from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team
 from credo.runner import Runner
-from credo.runs import checkpoint, config
+from credo.runs import checkpoint, config, files
 from credo.runs.config import ConfigError
 from credo.runs.export import export
 from credo.runs.policy import Policy
@@ -49,7 +49,7 @@ def recorded(path, algorithm, policy, **record):
     path.mkdir()
     checkpoint.export_policy(path / "champion.safetensors", policy)
     tree = json.loads(json.dumps(config.to_tree(algorithm)))
-    config.write_json(path / "config.json", {"algorithm": tree, "seed": 0} | record)
+    files.write_json(path / "config.json", {"algorithm": tree, "seed": 0} | record)
     return Run(path)
 
 
@@ -126,7 +126,7 @@ def test_a_strangers_run_acts_and_is_exported_without_an_import(tmp_path, monkey
     run = recorded(tmp_path / "run", algorithm, policy, task=task(BOX))
     env = {"class": "credo.environments.gymnasium:Gymnasium", "id": "strangers_own:Task"}
     run.config["algorithm"]["env"] = env
-    config.write_json(run.path / "config.json", run.config)
+    files.write_json(run.path / "config.json", run.config)
     run = Run(tmp_path / "run")
     ours, act = run.policy(), Runner.load(export(run, tmp_path / "p.safetensors"))
     assert act.description["task"] == "strangers_own:Task"

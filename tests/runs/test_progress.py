@@ -14,7 +14,7 @@ ROW = {"champion_score": 0.5, "fitness_max": 12.345}
 def updated(budget, tmp_path, capsys, *, frames):
     with Progress(tmp_path / "run", 0, 0, budget) as bar:
         bar.update(1, ROW | {"frames": frames}, 10.0)  # compiles
-        bar.last_line = 0.0
+        bar.line.last = -10.0
         bar.update(2, ROW | {"frames": 2 * frames}, 1.0)
         return capsys.readouterr().err.splitlines()
 
@@ -41,7 +41,7 @@ def test_of_two_limits_the_nearer_one_tells_the_time_left(tmp_path, capsys):
 
 def test_nothing_is_said_unless_asked(tmp_path, capsys):
     with Progress(tmp_path, 0, 0, Budget(generations=2), shown=False) as bar:
-        bar.start()
+        bar.start([])
         bar.update(1, ROW | {"frames": 3}, 1.0)
     assert capsys.readouterr().err == ""
     assert (bar.generation, bar.frames) == (1, 3)

@@ -219,7 +219,7 @@ def respond(
     xs = jnp.moveaxis(inputs, 1, 0)
     if size == 1:
         return segment(carry, xs)[1].T
-    # Steps behind the end fill the last segment; nobody asks for their answers.
+    # Steps behind the end fill the last segment; their answers are not asked for.
     count = -(-steps // size)
     xs = jnp.pad(xs, ((0, count * size - steps), (0, 0), (0, 0)))
     xs = xs.reshape(count, size, *xs.shape[1:])

@@ -6,7 +6,7 @@ one from each population.
 
 Departures from the printed box:
 
-- Teams are drawn at random (line 5), so that φ is an average and now and then somebody is in none:
+- Teams are drawn at random (line 5), so that φ is an average and now and then a member is in none:
   it has no fitness and ranks last. `teaming="balanced"` draws permutations instead.
 - "Assign reward to each member" (line 8) does not say how several teams make one fitness: it is
   their mean; `assignment="best"` takes the best (Wiegand et al. 2001). With a private signal, such

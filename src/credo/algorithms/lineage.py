@@ -31,8 +31,8 @@ class Lineage(eqx.Module):
     def first(cls, pop: int, q: int) -> "Lineage":
         """Of a population that was just drawn."""
         share = jnp.zeros((pop, 1 + q)).at[:, 0].set(1.0)
-        nobody, none = jnp.full(pop, -1, jnp.int32), jnp.zeros(pop)
-        return cls(jnp.full(pop, DRAWN, jnp.int32), share, nobody, none, none)
+        nowhere, none = jnp.full(pop, -1, jnp.int32), jnp.zeros(pop)
+        return cls(jnp.full(pop, DRAWN, jnp.int32), share, nowhere, none, none)
 
     def averaged(self, fitness: Float[Array, " pop"]) -> tuple["Lineage", Float[Array, " pop"]]:
         """With one more fitness of every member; and the mean of all fitness that each had and of

@@ -223,22 +223,6 @@ class CountingStudy(eqx.Module):
         be the same) that counted as many of +1?"""
         return jnp.all(jnp.max(self.counted, axis=2) >= signals, axis=1)
 
-    def report(self, policy: int) -> str:
-        """The table of one policy, and where each of its cells stopped counting."""
-        cells = range(1, self.memory.shape[2] + 1)
-        lines = [f"{'#-1s':>9} {'#+1s':>9}  " + " ".join(f"{f'M{i}':>12}" for i in cells)]
-        rows = zip(self.negatives, self.positives, self.memory[:, policy], strict=True)
-        for minus, plus, memory in rows:
-            values = " ".join(f"{value:12.2f}" for value in memory.tolist())
-            lines.append(f"{int(minus):9d} {int(plus):9d}  {values}")
-        fed = (int(self.negatives[-1]), int(self.positives[-1]))
-        for sign, total, counted in zip(("-1", "+1"), fed, self.counted[policy], strict=True):
-            for i, count in zip(cells, counted.tolist(), strict=True):
-                if count:
-                    end = "to the end" if count == total else f"up to {count}, then stopped"
-                    lines.append(f"M{i} counted {sign} {end}")
-        return "\n".join(lines)
-
 
 def counting_study(
     policies: PyTree,

@@ -1,9 +1,9 @@
-"""Floors and ceilings of the server fleet: what a net number of served requests is worth.
+"""Baselines and upper bound of the server fleet: what a net number of served requests is worth.
 
-Floors need no memory: random devices, and one fixed device per server. The ceiling is an oracle
-that knows the classes. Between them a scripted fleet that finds the classes out and shares them:
-what it earns was really earned, so it is a lower bound on the best that discovering can reach.
-For tiny synchronous fleets that best is computed exactly.
+Random devices, and one fixed device per server, need no memory. The upper bound is an oracle that
+knows the classes. Between them a scripted fleet finds the classes out and shares them: its return
+is a lower bound on the best that discovering can reach, which is computed exactly for tiny
+synchronous fleets.
 """
 
 import dataclasses
@@ -22,24 +22,11 @@ from ..environments.server_fleet import ACTS, AWAY, FleetState, ServerFleet, spa
 from ..networks.base import AbstractPolicy
 from ..networks.dmmu import DMMUPolicy
 from ..rollout import record
-from .statistics import mean_and_standard_error
+from ..types import Bound
+from .scripts import Start, random_team, simulate, starts
 
+EPISODES, SEED = 1000, 21_000  # that baselines and upper bound are the means of
 HISTORIES = 2_000_000  # joint choices that the exact search may look at
-
-
-class RandomFleet(AbstractPolicy):
-    """Every server draws a device at every step."""
-
-    servers: int = eqx.field(static=True)
-    devices: int = eqx.field(static=True)
-
-    def start(self, *, key: PRNGKeyArray) -> PRNGKeyArray:
-        return key
-
-    def __call__(self, obs: Float[Array, "servers obs"], carry: PRNGKeyArray):
-        carry, key = jax.random.split(carry)
-        shape = (self.servers, self.devices)
-        return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0), carry
 
 
 class FixedFleet(AbstractPolicy):
@@ -59,16 +46,15 @@ class DiscoveringFleet(AbstractPolicy):
     """A fleet that shares what each server was told, and decides for all in one place.
 
     It sees what the servers observe, no more. Who acts takes, in turn, the device of most worth: a
-    genuine request is worth 1 and an empty device 0; a device nobody has served yet is worth p - q
+    genuine request is worth 1 and an empty device 0; a device not served so far is worth p - q
     for the request and p for each further one that the fleet will have time for beyond the genuine
     requests it knows of (p: its probability to be genuine by all that is known, q = 1 - p); a
-    nefarious one -1. Nobody serves an unknown device that another one is serving unless it pays
+    nefarious one -1. No two serve an unknown device at the same time unless it pays
     at once. That rule looks ahead by a rough count, so better fleets may exist.
     """
 
     chance: Float[Array, "devices+1 devices+1"]
     """Probability that an unknown device is genuine, by the genuine and nefarious ones found."""
-    servers: int = eqx.field(static=True)
     devices: int = eqx.field(static=True)
     requests: int = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
@@ -82,7 +68,7 @@ class DiscoveringFleet(AbstractPolicy):
         known, step = carry
         pending, told, status = obs[:, : self.devices], obs[:, self.devices : -1], obs[:, -1]
         known = jnp.where(known == 0.0, jnp.sign(jnp.sum(told, axis=0)), known)
-        # Only who acts sees the counts; if nobody does they are not needed.
+        # Only who acts sees the counts; if no server does they are not needed.
         left = jnp.max(pending, axis=0)
         acting, present = status == ACTS, status != AWAY
         rounds = jnp.ceil((self.max_steps - step).astype(jnp.float32) / self.cycle)
@@ -110,13 +96,8 @@ class DiscoveringFleet(AbstractPolicy):
         return jnp.where(left > 0.0, jnp.where(known == 0.0, unknown, known), 0.0)
 
 
-def random_fleet(env: ServerFleet) -> RandomFleet:
-    """The floor of random choices for the servers of `env`."""
-    return RandomFleet(env.servers, env.devices)
-
-
 def fixed_fleet(env: ServerFleet) -> FixedFleet:
-    """The floor of choices that never change for the servers of `env`."""
+    """The baseline of choices that never change for the servers of `env`."""
     return FixedFleet(env.servers, env.devices)
 
 
@@ -134,62 +115,79 @@ def discovering_fleet(env: ServerFleet) -> DiscoveringFleet:
             "the scripted fleet reads ServerFleet(observation='signed one-hot', status=True, "
             "scale=(1.0, 1.0)); the game is the same"
         )
-    sizes = (env.servers, env.devices, env.requests, env.max_steps)
+    sizes = (env.devices, env.requests, env.max_steps)
     chance = jnp.asarray(_chance(env.devices, *span(env.nefarious)), jnp.float32)
     return DiscoveringFleet(chance, *sizes, cycle=1.0 + sum(span(env.busy)) / 2)
 
 
-def starts(env: ServerFleet, episodes: int, *, key: PRNGKeyArray) -> FleetState:
-    """Start states of that many episodes; leaves `[episodes, ...]`."""
-    return _reset(env, jax.random.split(key, episodes))
-
-
+@jit
 def play_fleet(
-    env: ServerFleet, states: FleetState, fleet: AbstractPolicy, *, key: PRNGKeyArray
+    env: ServerFleet, starts: Start, fleet: AbstractPolicy, *, key: PRNGKeyArray
 ) -> Float[Array, " episodes"]:
     """Net requests served by a policy `(obs, carry) -> (action, carry)` from each start."""
-    return _play_fleet(env, states, fleet, jax.random.split(key, states.step.shape[0]))
+
+    def one(start, key):
+        start_key, key = jax.random.split(key)
+        carry = fleet.start(key=start_key)
+        return simulate(env, start, lambda _, obs, carry: fleet(obs, carry), carry, key)
+
+    return jax.vmap(one)(starts, jax.random.split(key, starts[0].step.shape[0]))
 
 
-def play_oracle(
-    env: ServerFleet, states: FleetState, *, key: PRNGKeyArray
-) -> Float[Array, " episodes"]:
+@jit
+def play_oracle(env: ServerFleet, starts: Start, *, key: PRNGKeyArray) -> Float[Array, " episodes"]:
     """Net requests served from each start by a fleet that knows the classes and never collides.
 
-    No fleet earns more on average: how often servers act does not depend on what they choose, each
-    act earns 1 as long as a genuine request is pending, and 0 after that. (Where no device is
+    No fleet exceeds it on average: how often servers act does not depend on what they choose, each
+    act pays 1 as long as a genuine request is pending, and 0 after that. (Where no device is
     genuine all keep to one device, and lose its requests at most, the least that can be lost.)
     """
-    return _play_oracle(env, states, jax.random.split(key, states.step.shape[0]))
+
+    def act(state: FleetState, obs, carry):
+        acting = env.present(state.step) & (state.busy == 0)
+        return _action(_assign(state.genuine, state.pending, acting), env.devices), carry
+
+    keys = jax.random.split(key, starts[0].step.shape[0])
+    return jax.vmap(lambda start, key: simulate(env, start, act, (), key))(starts, keys)
 
 
-def floors_and_ceilings(
-    env: ServerFleet, episodes: int = 1000, *, key: PRNGKeyArray
-) -> dict[str, tuple[float, float]]:
-    """Mean net requests served per episode, and its standard error, all from the same starts.
-
-    **Returns:** the floors `random` and `fixed`, then `discovering` (a lower bound on what can be
-    reached without knowing the classes) and `oracle` (the ceiling).
-    """
+def played(
+    env: ServerFleet, episodes: int = EPISODES, *, oracle: bool = False
+) -> dict[str, Float[np.ndarray, " episodes"]]:
+    """Net requests served in each of the same episodes by `random` servers, by `fixed` ones, by the
+    `discovering` fleet (a lower bound on what can be reached without knowing the classes); or by
+    the `oracle` alone."""
     env = dataclasses.replace(env, observation="signed one-hot", status=True, scale=(1.0, 1.0))
-    start_key, play_key = jax.random.split(key)
-    states = starts(env, episodes, key=start_key)
-    fleets = {
-        "random": random_fleet(env),
-        "fixed": fixed_fleet(env),
-        "discovering": discovering_fleet(env),
+    start_key, play_key = jax.random.split(jax.random.key(SEED))
+    begun = starts(env, episodes, key=start_key)
+    if oracle:
+        return {"oracle": np.asarray(play_oracle(env, begun, key=play_key))}
+    fleets = {"random": random_team, "fixed": fixed_fleet, "discovering": discovering_fleet}
+    return {
+        name: np.asarray(play_fleet(env, begun, fleet(env), key=play_key))
+        for name, fleet in fleets.items()
     }
-    earned = {name: play_fleet(env, states, x, key=play_key) for name, x in fleets.items()}
-    earned["oracle"] = play_oracle(env, states, key=play_key)
-    rows = {name: mean_and_standard_error(np.asarray(x)) for name, x in earned.items()}
-    return {name: (float(mean), float(error)) for name, (mean, error) in rows.items()}
+
+
+def baselines(env: ServerFleet) -> dict[str, float]:
+    """Mean net requests of the fleets of `played`."""
+    return {name: _mean(net) for name, net in played(env).items()}
+
+
+def upper_bound(env: ServerFleet) -> Bound:
+    """Mean net requests of the oracle."""
+    return Bound(_mean(played(env, oracle=True)["oracle"]), "upper bound")
+
+
+def _mean(net: Float[np.ndarray, " episodes"]) -> float:
+    return float(np.mean(net, dtype=np.float64))
 
 
 def best_discovery(env: ServerFleet) -> float:
-    """The most that any fleet can earn on average without knowing the classes, exactly.
+    """The most net requests, on average, that any fleet can serve without knowing the classes.
 
     By search over all joint choices of a fleet that shares everything at once, which no fleet can
-    surpass: 14/3 for the case study, of which the scripted fleet earns 4.3.
+    surpass: 14/3 for the case study, of which the scripted fleet serves 4.3.
 
     ValueError unless all servers act at the same steps (one number of busy steps, no schedule), or
     if there are too many choices.
@@ -257,44 +255,6 @@ def _action(device: Int[Array, " servers"], devices: int) -> Float[Array, "serve
     return 2.0 * jax.nn.one_hot(device, devices) - 1.0
 
 
-@jit
-def _reset(env: ServerFleet, keys: PRNGKeyArray) -> FleetState:
-    return jax.vmap(lambda key: env.reset(key=key)[0])(keys)
-
-
-def _simulate(env: ServerFleet, start: FleetState, act, carry: PyTree, key: PRNGKeyArray):
-    """Net requests served in an episode of `act(state, obs, carry) -> (action, carry)`."""
-
-    def advance(loop, step):
-        state, now, carry = loop
-        action, carry = act(state, now.obs, carry)
-        state, now = env.step(state, action, key=jax.random.fold_in(key, step))
-        return (state, now, carry), now.rewards["net"]
-
-    begun = env.begin(start.genuine)
-    _, net = jax.lax.scan(advance, (*begun, carry), jnp.arange(env.max_steps))
-    return jnp.sum(net)
-
-
-@jit
-def _play_fleet(env: ServerFleet, states: FleetState, fleet: AbstractPolicy, keys: PRNGKeyArray):
-    def one(state, key):
-        start_key, key = jax.random.split(key)
-        carry = fleet.start(key=start_key)
-        return _simulate(env, state, lambda _, obs, carry: fleet(obs, carry), carry, key)
-
-    return jax.vmap(one)(states, keys)
-
-
-@jit
-def _play_oracle(env: ServerFleet, states: FleetState, keys: PRNGKeyArray):
-    def act(state: FleetState, obs, carry):
-        acting = env.present(state.step) & (state.busy == 0)
-        return _action(_assign(state.genuine, state.pending, acting), env.devices), carry
-
-    return jax.vmap(lambda state, key: _simulate(env, state, act, (), key))(states, keys)
-
-
 def _assign(
     genuine: Bool[Array, " devices"], pending: Int[Array, " devices"], acting: Bool[Array, " n"]
 ) -> Int[Array, " n"]:
@@ -305,7 +265,7 @@ def _assign(
         sought = genuine & (left > 0)
         empty = left <= 0
         device = jnp.where(jnp.any(sought), jnp.argmax(sought), jnp.argmax(empty))
-        # Where no device is genuine, one that someone takes must not look empty to the next.
+        # Where no device is genuine, one that is taken must not look empty to the next.
         taken = (jnp.arange(left.size) == device) & acts & genuine
         return left - taken.astype(jnp.int32), device
 

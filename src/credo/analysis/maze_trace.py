@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
@@ -11,7 +10,6 @@ from ..environments.extended_tmaze import ExtendedTMaze
 from ..networks.base import AbstractPolicy
 from ..networks.team import TeamPolicy
 from ..rollout import record
-from ..types import Trace
 from .memory import known_memory
 
 
@@ -43,26 +41,17 @@ class MazeTrace(eqx.Module):
 
 
 def trace_maze(env: ExtendedTMaze, policy: AbstractPolicy, *, key: PRNGKeyArray) -> MazeTrace:
-    """The episode that `evaluate(env, tree.stack(policy), 1, key=key)` plays."""
-    memory = isinstance(policy, TeamPolicy)
-    return by_trial(env, record(env, policy, key=key), memory=memory)
-
-
-def by_trial(env: ExtendedTMaze, played: Trace, *, memory: bool = True) -> MazeTrace:
-    """A recorded episode, trial by trial. `memory`: whether the carry is of each robot."""
-    state = played.states
-    ends = np.flatnonzero(np.diff(state.trial)) + 1  # the moments at which a trial is over
-    last = jax.tree.map(lambda x: x[ends], (state, played.observations))
-    cells = known_memory(played.carries) if memory else None
-    # At its end the static robot is already on its way to the endpoint of the next trial.
-    partner = None if state.partner is None else state.partner[ends - 1]
-    told = last[1][:, :, 1:] > 0.0
+    """The episode that `evaluate(env, tree.stack(policy), 1, key=key)` plays, trial by trial."""
+    played = record(env, policy, key=key)
+    shown = env.shown(played)
+    ends = np.flatnonzero(np.diff(played.states.trial)) + 1  # the moments at which a trial is over
+    cells = known_memory(played.carries) if isinstance(policy, TeamPolicy) else None
     return MazeTrace(
-        last[0].goals[np.arange(env.trials), np.arange(env.trials) >> env.depth],
-        np.asarray(played.rewards["score"][ends - 1] > 0.0),
-        last[0].endpoint,
-        partner,
-        told[:, :, 0],
-        told[:, :, 1],
-        None if cells is None else cells[ends],
+        goal=shown["goal"],
+        observed=shown["observed"],
+        endpoint=shown["endpoint"],
+        partner=shown.get("static"),
+        company=shown["company"],
+        reward=shown["reward"],
+        memory=None if cells is None else cells[ends],
     )

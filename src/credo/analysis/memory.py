@@ -7,7 +7,7 @@ and 3.7 (writes), Algorithm 3 (the pseudo-algorithm). The probes take one policy
 
 import dataclasses
 import itertools
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -126,28 +126,21 @@ class Relevance(eqx.Module):
         return self.success - self.without
 
 
-def relevant_cells(
-    policy: AbstractPolicy, sequences: Sequence, hold: Literal["zero", "start"] = "zero"
-) -> Relevance:
-    """The value of each cell, by masking it throughout a run.
+def relevant_cells(policy: AbstractPolicy, sequences: Sequence) -> Relevance:
+    """The value of each cell, by holding it at zero throughout a run, as if it were not there.
 
     Up to 8 cells `needed` is the smallest set (of equals the one with the best success, then the
     first); beyond, cells are dropped one at a time, the least missed first, and the set is only
     one from which no further cell can go.
 
-    **Arguments:** `sequences` `[n, ...]`, `lay_out(task, permutations(3))` for Table 3.1; `hold`
-    masked cells at zero (as a cell that is not there) or at the value from which they start (a
-    constant cell then costs nothing).
+    **Arguments:** `sequences` `[n, ...]`, `lay_out(task, permutations(3))` for Table 3.1.
     """
-    if hold not in ("zero", "start"):
-        raise ValueError(f"hold is {hold!r}: it must be 'zero' or 'start'")
-    start = memory_of(policy.start(key=jax.random.key(0)))
-    held = start if hold == "start" else jnp.zeros_like(start)
+    held = jnp.zeros_like(memory_of(policy.start(key=jax.random.key(0))))
 
     def success(keep) -> np.ndarray:
         return np.asarray(_masked_success(policy, sequences, jnp.asarray(keep), held))
 
-    cells = start.shape[0]
+    cells = held.shape[0]
     unmasked = float(success(np.ones((1, cells), bool))[0])
     without = success(~np.eye(cells, dtype=bool))
     needed = _smallest if cells <= EXHAUSTIVE else _dropped
@@ -205,17 +198,10 @@ def signature(
 
 
 def writes(policy: AbstractPolicy, inputs: Float[Array, "time in"]) -> Float[Array, "time cells"]:
-    """By how much each step moved each cell, with its sign."""
+    """By how much each step moved each cell, with its sign; how far in Figures 3.6 and 3.7."""
     memory = _recall(policy, inputs[None])[1][0]
     start = memory_of(policy.start(key=jax.random.key(0)))
     return jnp.diff(memory, axis=0, prepend=start[None])
-
-
-def write_magnitudes(
-    policy: AbstractPolicy, inputs: Float[Array, "time in"]
-) -> Float[Array, "time cells"]:
-    """How far each step moved each cell (Figures 3.6 and 3.7)."""
-    return jnp.abs(writes(policy, inputs))
 
 
 def share_at_signals(

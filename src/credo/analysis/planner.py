@@ -1,9 +1,8 @@
-"""Floors and ceilings of the rover domain: what a share of observed POIs is worth.
+"""Baselines and upper bound of the rover domain: what a share of observed POIs is worth.
 
-Floors act by the sensors alone: random actions, straight lines, and a greedy team that heads for
-the POI it sees closest. Ceilings know all positions: a scripted team whose share was really
-achieved, and an upper bound that no policy whatsoever can pass. Between the two lies the best
-policy for that world.
+Random actions, straight lines, and a greedy team that heads for the POI it sees closest, act by
+the sensors alone. Two numbers know all positions: a scripted team whose share was really achieved,
+and an upper bound that is proven. Between the two lies the best policy for that world.
 """
 
 import dataclasses
@@ -16,31 +15,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..compilation import jit
 from ..environments.rover import BRACKETS, CODED_SPEED, Rover, RoverState
 from ..networks.base import AbstractPolicy
+from ..types import Bound
+from .scripts import Start, random_team, simulate, starts
 
+WORLDS, SEED = 50, 21_000  # that baselines and upper bound are the means of
 EXHAUSTIVE = 4  # POIs up to which every division among the groups is tried
 KEPT = 16  # plans per world that are played in the environment
 STATES = 100_000  # coverages of the POIs that the exact bound may tell apart
 AROUND = 24  # meeting points per POI that a plan chooses from
-
-
-class RandomTeam(AbstractPolicy):
-    """Every rover draws a uniform action at every step."""
-
-    agents: int = eqx.field(static=True)
-    amplitude: float = 1.0  # the largest action, in [0, 1]
-
-    def start(self, *, key: PRNGKeyArray) -> PRNGKeyArray:
-        return key
-
-    def __call__(self, obs: Float[Array, "agents obs"], carry: PRNGKeyArray):
-        carry, key = jax.random.split(carry)
-        drawn = jax.random.uniform(key, (self.agents, 2), minval=-1.0, maxval=1.0)
-        return self.amplitude * drawn, carry
 
 
 class StraightLines(AbstractPolicy):
@@ -82,18 +69,13 @@ class GreedyTeam(AbstractPolicy):
         return _action(_possible(turn, self.coded), drive, self.coded), carry
 
 
-def random_team(env: Rover) -> RandomTeam:
-    """The floor of random actions for the rovers of `env`."""
-    return RandomTeam(env.agents)
-
-
 def straight_lines(env: Rover) -> StraightLines:
-    """The floor of straight lines for the rovers of `env`."""
+    """The baseline of straight lines for the rovers of `env`."""
     return StraightLines(env.agents, env.motion == "as-coded")
 
 
 def greedy_team(env: Rover) -> GreedyTeam:
-    """The greedy floor for `env`; ValueError unless its observation is "relative"."""
+    """The greedy baseline for `env`; ValueError unless its observation is "relative"."""
     if env.observation != "relative":
         raise ValueError(
             f"observation is {env.observation!r}: the greedy team reads brackets around its own "
@@ -102,20 +84,21 @@ def greedy_team(env: Rover) -> GreedyTeam:
     return GreedyTeam(env.max_speed, env.motion == "as-coded")
 
 
-def starts(env: Rover, worlds: int, *, key: PRNGKeyArray) -> RoverState:
-    """Start states of that many worlds; leaves `[worlds, ...]`."""
-    return _reset(env, jax.random.split(key, worlds))
-
-
+@jit
 def play_team(
-    env: Rover, states: RoverState, team: AbstractPolicy, *, key: PRNGKeyArray
+    env: Rover, starts: Start, team: AbstractPolicy, *, key: PRNGKeyArray
 ) -> Float[Array, " worlds"]:
-    """Global reward, in [0, 1], of a policy `(obs, carry) -> (action, carry)` from each start."""
-    keys = jax.random.split(key, states.step.shape[0])
-    return _play_team(_global(env), states, team, keys)
+    """Global reward, in [0, 1], of a policy `(obs, carry) -> (action, carry)` from each start.
+    `env` and its starts must have the reward "global"."""
+
+    def one(start, key):
+        carry = team.start(key=key)
+        return simulate(env, start, lambda _, obs, carry: team(obs, carry), carry, key)
+
+    return jax.vmap(one)(starts, jax.random.split(key, starts[0].step.shape[0]))
 
 
-def scripted_team(env: Rover, states: RoverState) -> Float[np.ndarray, " worlds"]:
+def scripted_team(env: Rover, starts: Start) -> Float[np.ndarray, " worlds"]:
     """Global reward, in [0, 1], that a team with full knowledge achieved from each start.
 
     It forms floor(rovers / coupling) groups, at most as many as POIs, and spare rovers join them.
@@ -124,14 +107,15 @@ def scripted_team(env: Rover, states: RoverState) -> Float[np.ndarray, " worlds"
     there first. A group drives to the near side of its next POI and waits there for all its rovers.
     Groups never mix, so where time is short a better team may exist; the bound says how much.
     """
-    rovers, poi = (np.asarray(x, np.float64) for x in (states.position, states.poi))
+    state = starts[0]
+    rovers, poi = (np.asarray(x, np.float64) for x in (state.position, state.poi))
     plans = [_plan(env, *world) for world in zip(rovers, poi, strict=True)]
     table = Plans(*(jnp.asarray(np.stack(parts)) for parts in zip(*plans, strict=True)))
-    return np.asarray(_play_plans(_global(env), states, table)).max(axis=1)
+    return np.asarray(_play_plans(env, starts, table)).max(axis=1)
 
 
-def upper_bound(env: Rover, state: RoverState) -> float:
-    """A share of the global reward, in [0, 1], that no policy can pass from this start.
+def bound_from(env: Rover, state: RoverState) -> float:
+    """A share of the global reward, in [0, 1], that no policy exceeds from this start.
 
     Proof. Who was within d_a of POI a and later of POI b has driven at least |ab| - 2·d_a between,
     and |sa| - d_a from its start s to the first: where the sum over a sequence of POIs exceeds
@@ -161,31 +145,36 @@ def upper_bound(env: Rover, state: RoverState) -> float:
     return min(1.0, _best_cover(sets, values, env.coupling))
 
 
-def floors_and_ceilings(
-    env: Rover, worlds: int = 100, *, draws: int = 10, key: PRNGKeyArray
-) -> list[dict[str, float]]:
-    """One row per world: the global reward of each floor, of the script, and the upper bound.
+def baselines(env: Rover, worlds: int = WORLDS, *, draws: int = 10) -> dict[str, float]:
+    """Mean global rewards, in [0, 1], from the same starts: random, straight, greedy (if `env` has
+    the "relative" observation) and scripted.
 
     **Arguments:** `draws`: games per world that "random" and "straight" are the mean of.
-    **Returns:** rows with the keys random, straight, greedy (if `env` has the "relative"
-    observation), scripted and bound, all in [0, 1].
     """
-    start_key, random_key, straight_key, greedy_key = jax.random.split(key, 4)
-    states = starts(env, worlds, key=start_key)
-    columns = {}
-    floors = (("random", random_team, random_key), ("straight", straight_lines, straight_key))
-    for name, team, team_key in floors:
-        games = [
-            play_team(env, states, team(env), key=draw)
-            for draw in jax.random.split(team_key, draws)
-        ]
-        columns[name] = np.mean(games, axis=0)
+    env, begun, (random_key, straight_key, greedy_key) = _worlds(env, worlds)
+    found = {}
+    drawn = (("random", random_team, random_key), ("straight", straight_lines, straight_key))
+    for name, team, team_key in drawn:
+        keys = jax.random.split(team_key, draws)
+        found[name] = np.mean([play_team(env, begun, team(env), key=key) for key in keys], axis=0)
     if env.observation == "relative":
-        columns["greedy"] = play_team(env, states, greedy_team(env), key=greedy_key)
-    columns["scripted"] = scripted_team(env, states)
-    worlds_ = [jax.tree.map(operator.itemgetter(i), states) for i in range(worlds)]
-    columns["bound"] = [upper_bound(env, world) for world in worlds_]
-    return [{name: float(x[i]) for name, x in columns.items()} for i in range(worlds)]
+        found["greedy"] = play_team(env, begun, greedy_team(env), key=greedy_key)
+    found["scripted"] = scripted_team(env, begun)
+    return {name: float(np.mean(np.asarray(x, np.float64))) for name, x in found.items()}
+
+
+def upper_bound(env: Rover, worlds: int = WORLDS) -> Bound:
+    """The mean of `bound_from` over the worlds of `baselines`."""
+    env, (states, _), _ = _worlds(env, worlds)
+    each = [bound_from(env, jax.tree.map(operator.itemgetter(i), states)) for i in range(worlds)]
+    return Bound(float(np.mean(each)), "upper bound")
+
+
+def _worlds(env: Rover, worlds: int) -> tuple[Rover, Start, list[PRNGKeyArray]]:
+    """The task with the global reward alone, so many starts of it, and keys of what is played."""
+    env = dataclasses.replace(env, rewards=("global",))
+    start_key, *keys = jax.random.split(jax.random.key(SEED), 4)
+    return env, starts(env, worlds, key=start_key), keys
 
 
 # Acting
@@ -213,40 +202,6 @@ def _speed(env: Rover) -> float:
     return CODED_SPEED if env.motion == "as-coded" else float(env.max_speed)
 
 
-def _global(env: Rover) -> Rover:
-    """The same world that computes only the global reward."""
-    return dataclasses.replace(env, rewards=("global",))
-
-
-@jit
-def _reset(env: Rover, keys: PRNGKeyArray) -> RoverState:
-    return jax.vmap(lambda key: env.reset(key=key)[0])(keys)
-
-
-def _simulate(env: Rover, start: RoverState, act, carry: PyTree) -> Float[Array, ""]:
-    """Global reward of one episode of `act(state, obs, carry) -> (action, carry)`."""
-
-    def ongoing(loop):
-        return ~(loop[1].terminated | loop[1].truncated)
-
-    def advance(loop):
-        state, now, carry = loop
-        action, carry = act(state, now.obs, carry)
-        return *env.step(state, action, key=jax.random.key(0)), carry  # a step draws nothing
-
-    begun = env.begin(start.position, start.heading, start.poi)
-    _, last, _ = jax.lax.while_loop(ongoing, advance, (*begun, carry))
-    return last.rewards["global"]
-
-
-@jit
-def _play_team(env: Rover, states: RoverState, team: AbstractPolicy, keys: PRNGKeyArray):
-    def one(state, key):
-        return _simulate(env, state, lambda _, obs, carry: team(obs, carry), team.start(key=key))
-
-    return jax.vmap(one)(states, keys)
-
-
 # Planning
 
 
@@ -259,7 +214,7 @@ class Plans(eqx.Module):
 
 
 @jit
-def _play_plans(env: Rover, states: RoverState, plans: Plans) -> Float[Array, "worlds plans"]:
+def _play_plans(env: Rover, starts: Start, plans: Plans) -> Float[Array, "worlds plans"]:
     def follow(state: RoverState, plan: Plans):
         open_ = (plan.route >= 0) & ~state.observed[plan.route]
         next_ = jnp.argmax(open_, axis=1)
@@ -272,10 +227,13 @@ def _play_plans(env: Rover, states: RoverState, plans: Plans) -> Float[Array, "w
         turn = _possible(jnp.where(busy, turn, 0.0), coded)
         return _action(turn, jnp.where(busy, drive, 0.0), coded)
 
-    def one(state, plan):
-        return _simulate(env, state, lambda state, obs, carry: (follow(state, plan), carry), ())
+    def one(start, plan):
+        def act(state, obs, carry):
+            return follow(state, plan), carry
 
-    return jax.vmap(lambda state, plans: jax.vmap(lambda p: one(state, p))(plans))(states, plans)
+        return simulate(env, start, act, (), jax.random.key(0))  # a step draws nothing
+
+    return jax.vmap(lambda start, plans: jax.vmap(lambda p: one(start, p))(plans))(starts, plans)
 
 
 def _plan(env: Rover, rovers: Float[np.ndarray, "rovers 2"], poi: Float[np.ndarray, "pois 2"]):

@@ -1,4 +1,4 @@
-"""Floors and ceilings of the Extended T-Maze: the share of trials in which the reward is observed.
+"""Baselines and upper bounds of the Extended T-Maze: shares of trials with the reward observed.
 
 All are exact: probabilities are counted in integers and returned as fractions; nothing is simulated
 or learned. With n = 2^depth endpoints and a reward that moves uniformly:
@@ -34,8 +34,9 @@ from fractions import Fraction
 from functools import cache
 
 from ..environments.extended_tmaze import ExtendedTMaze
+from ..types import Bound
 
-IMITATING = "imitating FSP"  # the one of the `floors` that needs memory
+IMITATING = "imitating FSP"  # the one of the `baselines` that needs memory
 EXACT_DEPTH = 2  # to which `optimal` takes seconds
 
 World = tuple[int, int, int]  # where the reward is, where the static robot goes, how it counts
@@ -46,14 +47,14 @@ Follow = Callable[[int, bool, int], int]
 
 
 def static_alone(env: ExtendedTMaze) -> Fraction:
-    """The static robot (`env.partner`, or FSP) in the maze with nobody else."""
+    """The static robot (`env.partner`, or FSP) alone in the maze."""
     return _play(env, None, 0)
 
 
 def imitating(env: ExtendedTMaze) -> Fraction:
     """FSP's own rules, played by the learning robot beside the static one, if there is one.
 
-    Beside FSP both are always at one endpoint, and in Converge nothing is better (`ceiling`).
+    Beside FSP both are always at one endpoint, and in Converge nothing is better (`upper_bound`).
     """
     n = env.endpoints
     return _play(env, lambda at, seen, trial: at if seen else (at + 1) % n, 0)
@@ -75,7 +76,8 @@ def searching(env: ExtendedTMaze) -> Fraction:
     """The learning robot counts down from the last endpoint, stays where feedback says reward, and
     counts on when the reward moves, which it knows by counting trials.
 
-    If moves are uniform, nothing is better for a robot alone, and in Spread beside FSP (`ceiling`).
+    If moves are uniform, nothing is better for a robot alone, and in Spread beside FSP
+    (`upper_bound`).
     """
     n = env.endpoints
 
@@ -125,11 +127,14 @@ def shared_information(env: ExtendedTMaze) -> Fraction:
     return (won([Fraction(1, n)] * n) + 2 * won(moved)) / env.trials
 
 
-def floors(env: ExtendedTMaze) -> dict[str, float]:
-    """Shares of trials that take no learning, for one learning robot.
+def baselines(env: ExtendedTMaze) -> dict[str, float]:
+    """Shares of trials that take no learning, for one learning robot or for a team without memory.
 
     The static robot's own share is one in Spread alone, where it counts without company.
     """
+    if env.robots > 1:
+        # Every endpoint is as likely as any other; without memory there are the first and the last.
+        return {"one at each end": min(2, env.robots) / env.endpoints}
     named = memoryless(env)
     if env.partner is not None and env.objective == "spread":
         named["static robot alone"] = static_alone(env)
@@ -138,16 +143,15 @@ def floors(env: ExtendedTMaze) -> dict[str, float]:
     return {name: float(share) for name, share in named.items()}
 
 
-def ceiling(env: ExtendedTMaze) -> tuple[str, float]:
-    """The share of trials that no policy can pass, and how far to trust it: "optimal", a policy
-    reaches it, or "upper bound", perhaps none does.
+def upper_bound(env: ExtendedTMaze) -> Bound:
+    """The share of trials that no policy exceeds.
 
     Beside FSP, at any depth, if the reward moves uniformly or Converge has feedback "own":
 
     - Converge. With feedback "own" FSP walks as if alone, and where it is not nothing is observed.
       With "objective" a robot that stays away for the last x > 0 trials of a third loses x and
       sends FSP ahead by x; FSP then finds the reward earlier by (n-x)/(n-1) <= x trials on average.
-    - Spread. FSP walks as if alone, and after n trials it is at the reward. Until somebody is, two
+    - Spread. FSP walks as if alone, and after n trials it is at the reward. Until one robot is, two
       robots see at most two new endpoints per trial, but one when FSP starts at the old place; so
       do FSP and `searching`, which is at the reward after n trials too.
 
@@ -160,17 +164,19 @@ def ceiling(env: ExtendedTMaze) -> tuple[str, float]:
     leaves that one out.
     """
     if env.partner is None:
-        return _reached(_team_reaches_bound(env)), float(shared_information(env))
+        kind = "optimal" if _team_reaches_bound(env) else "upper bound"
+        return Bound(float(shared_information(env)), kind)
     if env.robots == 1:
         converge = env.objective == "converge"
         regular = env.moves == "uniform" or (converge and env.feedback == "own")
         if regular and env.partner == "fsp":
-            return "optimal", float(static_alone(env) if converge else searching(env))
+            return Bound(float(static_alone(env) if converge else searching(env)), "optimal")
         if env.depth <= EXACT_DEPTH:
-            return "optimal", float(optimal(env))
+            return Bound(float(optimal(env)), "optimal")
         if env.moves == "uniform":
-            return "upper bound", ceiling(dataclasses.replace(env, partner="fsp"))[1]
-    return "upper bound", float(shared_information(env))
+            beside_fsp = upper_bound(dataclasses.replace(env, partner="fsp"))
+            return Bound(beside_fsp.value, "upper bound")
+    return Bound(float(shared_information(env)), "upper bound")
 
 
 def _team_reaches_bound(env: ExtendedTMaze) -> bool:
@@ -180,10 +186,6 @@ def _team_reaches_bound(env: ExtendedTMaze) -> bool:
         return env.feedback == "objective"
     divides = env.endpoints % env.robots == 0 and env.moves == "uniform"
     return divides or env.robots >= env.endpoints
-
-
-def _reached(reached: bool) -> str:
-    return "optimal" if reached else "upper bound"
 
 
 def _moves(env: ExtendedTMaze, goal: int) -> list[tuple[int, int]]:
@@ -305,7 +307,7 @@ class _Plan:
         return best
 
     def _sensible(self, belief: Belief) -> list[int]:
-        """Endpoints that somebody may be at, and one of the others, which are all alike."""
+        """Endpoints that a robot may be at or seek, and one of the others, which are all alike."""
         used = {x for (goal, static, _), _ in belief for x in (goal, static)}
         unused = [at for at in range(self.env.endpoints) if at not in used]
         return [*sorted(used), *unused[:1]]

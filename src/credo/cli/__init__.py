@@ -1,9 +1,8 @@
-"""The command line: one module a command, and the only place where names are looked up.
+"""The command line: the only place where names are looked up.
 
 Nothing here imports JAX before a command needs it: `credo --help` answers at once.
 """
 
-import importlib
 import os
 import sys
 import warnings
@@ -13,13 +12,18 @@ from .names import ALGORITHMS, COMMANDS, fail
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Entry point of `credo`. Whatever happens ends in a line and an exit code (see `ending`)."""
+    """Entry point of `credo`. Whatever happens ends in a line and an exit code (see `ending`).
+
+    **Arguments:** `argv`: what was typed behind `credo`; None: the process's own, which then ends
+    with the command.
+    """
     ending.open_streams()
-    words = [*(sys.argv[1:] if argv is None else argv)]  # `list` is a module here
+    words = list(sys.argv[1:] if argv is None else argv)
     ending.run(lambda: _command(words), alone=argv is None)
 
 
 def _command(argv: list[str]) -> None:
+    """Do what the first word says."""
     match argv:
         case [] | ["-h" | "--help" | "--help-all" | "help", *_]:
             print(overview())
@@ -27,34 +31,37 @@ def _command(argv: list[str]) -> None:
             from importlib.metadata import version
 
             print("credo", version("credo"))
-        case ["--print-completion" | "--complete" as what, *rest]:
+        case ["--print-completion", *shell]:
             from . import completion
 
-            print(
-                completion.script(*rest) if what == "--print-completion" else completion.next(rest)
-            )
+            print(completion.script(*shell))
+        case ["--complete", *words]:
+            from . import completion
+
+            print(completion.next(words))
         case [command, *rest]:
             _run(command, rest)
 
 
 def _run(command: str, argv: list[str]) -> None:
+    """Read the words and flags of a command, and call it. Its warnings are lines on stderr."""
     if command not in COMMANDS:
         if command in ALGORITHMS:
             fail(f"{command} is an algorithm: credo train {command} TASK")
         fail(f"no command {command!r}", command, COMMANDS)
+    from . import commands, settings
     from .line import Line
 
     warnings.showwarning = lambda message, *_args, **_kw: ending.say(f"warning: {message}")
-    sys.path.insert(0, _here())  # environments of users lie where they work
-    importlib.import_module(f".{command}", __name__).run(Line(command, argv))
-
-
-def _here() -> str:
     try:
-        return os.getcwd()
+        sys.path.insert(0, os.getcwd())  # environments of users lie where they work
     except OSError as error:
         ending.say(f"credo: this folder is not there any more ({error.strerror}): go to another")
         raise SystemExit(1) from None
+    line = Line(command, argv)
+    if command == "train":
+        settings.add_file(line)
+    line.command(getattr(commands, command.title()))(line)
 
 
 def overview() -> str:

@@ -3,9 +3,8 @@
 The script asks `credo --complete WORDS…` what can come next; that imports no JAX.
 """
 
-import importlib
-
 from ..experiments.catalogue import EXPERIMENTS
+from . import commands
 from .line import Line
 from .names import ALGORITHMS, CATALOGUE, COMMANDS, fail
 
@@ -18,14 +17,15 @@ SHELLS = {"bash": SCRIPT, "zsh": f"autoload -U +X bashcompinit && bashcompinit\n
 
 
 def script(shell: str = "") -> str:
-    """What a shell must be told."""
+    """What a shell must be told, to be evaluated by it."""
     if shell not in SHELLS:
         fail(f"no completion for {shell!r}", shell, SHELLS)
     return SHELLS[shell]
 
 
 def next(words: list[str]) -> str:
-    """What can stand behind these words, without files."""
+    """What can stand behind these words, separated by spaces; "" where it is a file. Of an
+    algorithm's flags it knows the short names alone: the others would need JAX."""
     match words:
         case []:
             return " ".join(COMMANDS)
@@ -39,9 +39,7 @@ def next(words: list[str]) -> str:
             return " ".join(CATALOGUE[f"{flag.strip('-')}s"])
         case [command, *_] if command in COMMANDS:
             line = Line(command, ["", ""])
-            line.command(getattr(importlib.import_module(f"credo.cli.{command}"), command.title()))
-            shorts = CATALOGUE["short"] if command == "train" else ()
-            return " ".join(
-                f"--{name}" for name in [*shorts, *(f.name for f in line.flags.values())]
-            )
+            line.command(getattr(commands, command.title()))
+            names = [*(CATALOGUE["short"] if command == "train" else ()), *line.known()]
+            return " ".join(f"--{name}" for name in names)
     return ""

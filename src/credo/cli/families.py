@@ -1,4 +1,8 @@
-"""Families: what can stand in a field that holds an object, such as a manager or a critic."""
+"""Families: what can stand in a field that holds an object, such as a manager or a critic.
+
+A member is chosen by its word in the catalogue, `--manager ucb`, or as a class of the user's,
+`--manager mine:Manager`; in a field that holds several, `--learners td3,sac`.
+"""
 
 import dataclasses
 import itertools
@@ -10,28 +14,26 @@ from .values import leaves
 
 
 class Family(NamedTuple):
-    """The known members of a type, by word."""
+    """What a field can hold, and the words for it."""
 
-    makers: dict[str, str]  # where the class or function is that makes one
+    makers: dict[str, str]
+    """Where the class or function is that makes one; "" of `none`, if the field may be empty."""
     bases: tuple[type, ...]
-    many: bool  # the field is a tuple of them
-    empty: bool  # the field may hold none
-
-    @property
-    def words(self) -> list[str]:
-        """What can be typed."""
-        return [*self.makers, *["none"] * (self.empty and "none" not in self.makers)]
+    """What a class of the user's must be derived from."""
+    many: bool
+    """The field is a tuple of them."""
 
     def word(self, value: Any) -> str:
-        """The word for what stands there."""
+        """The word for what stands there; of what has no word, the name of its class."""
         if isinstance(value, tuple):
             return ",".join(map(self.word, value)) or "none"
         words = {path: word for word, path in self.makers.items()}
         return "none" if value is None else words.get(_path(type(value)), type(value).__name__)
 
     def chosen(self, flag: str, words: list[str], old: Any) -> Any:
-        """What the words name; what is there already stays as it is."""
-        words = [] if words in (["none"], ["None"]) and "none" not in self.makers else words
+        """What the words name; a member of the same class that is there already stays as it is,
+        with its settings. A word may name a class of the user's, as package.module:Class."""
+        words = [] if words in (["none"], ["None"]) and not self.makers.get("none") else words
         there = old if self.many else (old,)
         pairs = itertools.zip_longest(words, there[: len(words)])
         made = tuple(self._one(flag, word, before) for word, before in pairs)
@@ -42,24 +44,26 @@ class Family(NamedTuple):
             maker = of_user(word)
             if not (isinstance(maker, type) and issubclass(maker, self.bases)):
                 fail(f"{word} is no {' or '.join(base.__name__ for base in self.bases)}")
-        elif word not in self.makers:
-            fail(f"no {flag} {word!r}", word, self.words)
+        elif not self.makers.get(word):
+            fail(f"no {flag} {word!r}", word, self.makers)
         else:
             maker = load(self.makers[word])
         return old if maker is type(old) else of_user(word, maker)
 
 
 def family_of(kind: Any) -> Family | None:
-    """The family of a field's type; None where there is nothing to choose."""
+    """The family of a field's type: what the catalogue lists for its classes, and of one that it
+    does not list the class itself. None where there is nothing to choose."""
     kinds = list(leaves(kind))
     bases = tuple(k for k in kinds if isinstance(k, type) and dataclasses.is_dataclass(k))
-    makers: dict[str, str] = {}
+    makers: dict[str, str] = {}  # a copy: the catalogue stays as it is
     for base in bases:
-        own = {base.__name__.lower(): _path(base)}
         abstract = base.__name__.startswith("Abstract")
-        makers |= CATALOGUE["families"].get(base.__name__, {} if abstract else own)
-    family = Family(makers, bases, tuple in kinds, tuple in kinds or types.NoneType in kinds)
-    return family if makers and len(family.words) > 1 else None
+        own = {} if abstract else {base.__name__.lower(): _path(base)}
+        makers |= CATALOGUE["families"].get(base.__name__, own)
+    if makers and (tuple in kinds or types.NoneType in kinds):
+        makers.setdefault("none", "")
+    return Family(makers, bases, tuple in kinds) if len(makers) > 1 else None
 
 
 def _path(cls: type) -> str:

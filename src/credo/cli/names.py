@@ -27,8 +27,12 @@ def load(path: str) -> Any:
 def fail(
     message: str, given: str = "", known: Iterable[str] = (), more: Iterable[str] = ()
 ) -> NoReturn:
-    """End with exit code 2: one line on what is wrong, and one on what was meant. `more`: names
-    that may have been meant, but are too many to be listed."""
+    """End with exit code 2: one line on what is wrong, and one on what was meant.
+
+    **Arguments:** `given`: the word that was typed. `known`: the words that can be typed; the one
+    nearest to `given` is named, or all are listed. `more`: names that may have been meant, but are
+    too many to be listed.
+    """
     ending.say(f"credo: {message}")
     known = list(known)
     if close := difflib.get_close_matches(given, [*known, *more], cutoff=0.5):
@@ -41,7 +45,8 @@ def fail(
 
 def of_user(name: str, call: Callable[[], Any] | None = None) -> Any:
     """What `call` makes of `package.module:name`, which was named on this command line; by default
-    what is found there. What it raises ends with where that was."""
+    what is found there. What it raises ends the command with where that was: it is the user's own
+    code, which may raise anything."""
     from ..environments.names import find
 
     module = repr(name.rpartition(":")[0])

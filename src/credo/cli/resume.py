@@ -1,9 +1,10 @@
-"""`credo resume RUN`."""
+"""`credo resume RUN`: to the run's own budget or a larger one, as it was or with other settings."""
 
 import dataclasses
 import pathlib
 from typing import Any
 
+from ..runs.ending import say
 from ..runs.options import RunOptions
 from .line import Line, shorts
 from .names import CATALOGUE, fail
@@ -19,58 +20,62 @@ class Resume:
     run: str
     _: dataclasses.KW_ONLY
     set: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """FIELD=VALUE, such as learning_rate=1e-4 or gamma=0.95: go on with another setting, which is
-    recorded."""
-    trust: bool = False  # the run was made elsewhere and names code of others: import it
-    without_replay: bool = False  # start with an empty replay buffer, where its files are damaged
+    """FIELD=VALUE, such as learning_rate=1e-4 or gamma=0.95: go on with another setting of the
+    algorithm. Weights, population and replay buffer stay; the run's record says what was changed
+    when. A run that is finished needs a larger budget with it."""
+    trust: bool = False
+    """Import the code that the run's record names, although the run was made elsewhere: to import a
+    module is to execute it."""
+    without_replay: bool = False
+    """Go on with an empty replay buffer if its files are damaged; else a run whose buffer cannot be
+    read is not resumed."""
     options: RunOptions = RunOptions()  # noqa: RUF009
 
+    def __call__(self, line: Line) -> None:
+        """Go on, with several runs in processes of their own, and print a summary of each."""
+        for name in [name for name, _ in line.given if name in CATALOGUE["short"]]:
+            setting = name.replace("-", "_")
+            fail(f"--{name} is a setting of the run's algorithm: give it as --set {setting}=VALUE")
+        line.done()
+        from ..executors import local
+        from ..runs import folder, loop
+        from ..runs.store import Run
 
-def run(line: Line) -> None:
-    """Go on; several runs in processes of their own."""
-    command = line.command(Resume)
-    for name in [name for name, _ in line.given if name in CATALOGUE["short"]]:
-        setting = name.replace("-", "_")
-        fail(f"--{name} is a setting of the run's algorithm: give it as --set {setting}=VALUE")
-    line.done()
-    from ..executors import local
-    from ..runs import config, folder, loop
-    from ..runs.store import Run
+        runs = folder.runs_in(self.run)
+        for path in runs if self.set else ():  # nothing was begun yet
+            self.set = _settings(Run(path, trust=self.trust).algorithm, self.set)
+        again: Any = {name: getattr(self, name) for name in ("set", "trust", "without_replay")}
+        jobs = [local.Job.resumed(path, self.options, **again) for path in runs]
+        for job in [job for job in jobs if self.set and job.finished()]:
+            more = "give a larger --generations or --frames with it"
+            say(f"credo: --set is not used: {job.path} is finished and trains no more; {more}")
+            again["set"] = {}
+        if len(runs) == 1:
+            loop.resume(runs[0], self.options, **again)
+        else:
+            local.run(jobs, title=pathlib.Path(self.run).name)
+        for path in runs:
+            print(Run(path, trust=self.trust).summary)
 
-    runs = folder.runs_in(command.run)
-    for name in command.set.keys() & BEGUN.keys():
+
+def _settings(algorithm: Any, changes: dict[str, Any]) -> dict[str, Any]:
+    """Changes by the paths of the fields that names such as gamma or elite_fraction stand for. One
+    that the algorithm cannot have ends the command, before anything was begun."""
+    from ..runs import config
+
+    for name in changes.keys() & BEGUN.keys():
         fail(f"--set {name}: {BEGUN[name]}")
-    for path in runs if command.set else ():  # nothing was begun yet
-        algorithm = Run(path, trust=command.trust).algorithm
-        command.set = _in_full(algorithm, command.set)
-        try:
-            config.replaced(algorithm, command.set)
-        except ValueError as error:
-            fail(f"--set: {error}")
-    again: Any = {name: getattr(command, name) for name in ("set", "trust", "without_replay")}
-    if len(runs) == 1:
-        loop.resume(runs[0], command.options, **again)
-    else:
-        jobs = [local.Job.resumed(path, command.options, **again) for path in runs]
-        local.run(jobs, title=pathlib.Path(command.run).name)
-    for path in runs:
-        print(Run(path, trust=command.trust).summary)
-
-
-def _in_full(algorithm: Any, changes: dict[str, Any]) -> dict[str, Any]:
-    """Changes by the paths of fields, which short names such as gamma stand for."""
     line = Line("resume", [])
     line.take(algorithm)
-
-    def meant(name: str) -> list[str]:
-        flags = {path: shorts(path) | {flag.name} for path, flag in line.flags.items()}
-        found = [path for path, names in flags.items() if name.replace("_", "-") in names]
-        inside = getattr(algorithm, "breeder", None)  # its fields need no prefix
-        bare = hasattr(inside, name.partition(".")[0])
-        return found or [f"breeder.{name}" if bare else name]
-
-    return {
-        path: value
-        for name, value in changes.items()
-        for path in ([name] if name in line.flags else meant(name))
-    }
+    found = {}
+    for name, value in changes.items():
+        flag = name.replace("_", "-")
+        meant = [path for path, f in line.flags.items() if flag in (shorts(path) | {f.name})]
+        bare = hasattr(getattr(algorithm, "breeder", None), name.partition(".")[0])
+        paths = [name] if name in line.flags else meant or ["breeder." * bare + name]
+        found |= dict.fromkeys(paths, value)
+    try:
+        config.replaced(algorithm, found)
+    except ValueError as error:
+        fail(f"--set: {error}")
+    return found

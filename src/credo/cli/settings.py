@@ -4,6 +4,7 @@ import dataclasses
 import json
 import pathlib
 import tomllib
+from collections.abc import Iterator
 from typing import Any
 
 from ..environments.names import OWN_TEAMS
@@ -13,9 +14,26 @@ from .names import fail
 OWN = ("config", "save_config", "print_config", "trust")  # about the file itself
 
 
+def add_file(line: Line) -> None:
+    """The settings of the file that `--config` names, as if they were typed before the others;
+    words that were typed take the place of its algorithm and task."""
+    files = [values[0] for name, values in line.given if name == "config" and values]
+    if not files:
+        return
+    said = [values for name, values in line.given if name == "trust"]
+    trust = bool(said) and said[-1][:1] in ([], ["True"], ["true"])
+    line.filed = read(files[-1], trust=trust)
+    saved = dict(line.filed)
+    words = [*saved.get("algorithm", []), *saved.get("task", [])]
+    line.words, line.used = line.words + words[len(line.words) :], {"algorithm", "task"}
+
+
 def read(path: str, *, trust: bool) -> list[tuple[str, list[str]]]:
-    """Flags as if they were typed. Tables may be nested: `[learner]`, `gamma = 0.9`. Whoever wrote
-    the file is not who typed its name: without `trust`, what names code of others is refused."""
+    """The settings of a file as names and values of flags, as they are typed.
+
+    Tables may be nested: `[learner]`, `gamma = 0.9`. Whoever wrote the file is not who typed its
+    name: without `trust`, what names code of others is refused, and the command ends.
+    """
     try:
         found = list(_flat(tomllib.loads(pathlib.Path(path).read_text("utf-8")), ""))
     except (OSError, ValueError) as error:
@@ -26,13 +44,13 @@ def read(path: str, *, trust: bool) -> list[tuple[str, list[str]]]:
         for value in values if not trust else ():
             team = name == "task" and "." in value and not value.startswith(OWN_TEAMS)
             if team or ":" in value or "\\" in value:  # an escape may hide a colon
-                fail(
-                    f"{path} names {value!r}, maybe code of others: look into it, and give --trust"
-                )
+                told = "maybe code of others: look into it, and give --trust"
+                fail(f"{path} names {value!r}, {told}")
     return found
 
 
-def _flat(table: dict[str, Any], prefix: str):
+def _flat(table: dict[str, Any], prefix: str) -> Iterator[tuple[str, list[str]]]:
+    """The flags of a table and of those inside it, with their values as they are typed."""
     for key, value in table.items():
         name = f"{prefix}{key}".replace("_", "-")
         if isinstance(value, dict):
@@ -42,23 +60,21 @@ def _flat(table: dict[str, Any], prefix: str):
 
 
 def written(command: Any, algorithm: Any) -> str:
-    """The settings of a command and of its algorithm, for `read`."""
+    """The settings of a command and of its algorithm, for `read`. Names that are the command's or
+    the algorithm's are not the task's: its field of the same name is `env.…`."""
     told = {"algorithm": command.algorithm, "task": command.task}
+    fields = [f.name for x in (command, command.options, algorithm) for f in dataclasses.fields(x)]
     for value, empty in ((command, (None, {}, ())), (algorithm, ())):
         line = Line("train", [])
-        # Names that are the command's own: a task's field of the same name is `env.…`.
-        line.reserved = _names(command, command.options, algorithm) - {"rewards", "kwargs"}
+        line.reserved = {name.replace("_", "-") for name in fields} - {"rewards", "kwargs"}
         line.skipped = {"algorithm", "task", "id", *OWN}
         line.take(value)
         told |= {flag.name: flag.value for flag in line.flags.values() if flag.value not in empty}
     return "".join(f"{json.dumps(name)} = {_toml(value)}\n" for name, value in told.items())
 
 
-def _names(*objects: Any) -> set[str]:
-    return {f.name.replace("_", "-") for x in objects for f in dataclasses.fields(x)}
-
-
 def _toml(value: Any) -> str:
+    """A value as TOML; `NAME=VALUE` settings are a list of such strings."""
     if isinstance(value, dict):
         value = [f"{name}={x!r}" for name, x in value.items()]
     if isinstance(value, tuple | list):

@@ -1,11 +1,11 @@
 """Tasks by name: Credo's own, a class or function of one's own, and those of other packages."""
 
+import contextlib
 import dataclasses
 import importlib
 import importlib.util
 import re
 import sys
-import traceback
 from typing import Any
 
 from ..environments import checks, names
@@ -14,7 +14,7 @@ from ..environments.gymnasium import Gymnasium
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..environments.pettingzoo import PettingZoo
 from ..require import suggestion
-from ..runs.ending import first, say
+from ..runs.ending import first, place, say
 from .names import CATALOGUE, TASKS, fail, load, of_user
 from .values import pairs
 
@@ -22,13 +22,18 @@ KINDS = {"gymnasium": Gymnasium, "pettingzoo": PettingZoo}
 
 
 def task(name: str, kwargs: dict[str, Any], rewards: tuple[str, ...]) -> Any:
-    """A task with its defaults, made with `kwargs`; `rewards` as in `with_settings`."""
+    """A task with its defaults, made with `kwargs`; `rewards` as in `with_settings`. Ends the
+    command with what was meant if the name is none."""
     return with_settings(_named(name, kwargs), kwargs, rewards)
 
 
 def with_settings(env: Any, kwargs: dict[str, Any], rewards: tuple[str, ...] = ()) -> Any:
-    """A task that is made with other `kwargs`, those that are not named stay; with other `rewards`:
-    names of a task's own ones, or NAME=MODULE:FUNCTION for a team of PettingZoo."""
+    """A task with other settings, also inside a wrapper.
+
+    **Arguments:** `kwargs`: what Gymnasium or PettingZoo makes it with, by name; those that are not
+    named stay. `rewards`: names of a task's own ones, the first is what training maximises; for a
+    team of PettingZoo NAME=MODULE:FUNCTION, which are added.
+    """
     if not (kwargs or rewards):
         return env
     known, new = {f.name for f in dataclasses.fields(env)}, {}
@@ -45,42 +50,38 @@ def with_settings(env: Any, kwargs: dict[str, Any], rewards: tuple[str, ...] = (
 
 
 def _named(name: str, kwargs: dict[str, Any]) -> Any:
+    """A task by the form of its name: a word of the catalogue, `module:Name`, the module of a team,
+    or an id of Gymnasium."""
     if name in TASKS:
         return load(TASKS[name]["path"])()
     if re.fullmatch(r"\w+(\.\w+)*:\w+", name):
         return _own(name, kwargs)
-    if re.fullmatch(r"\w+(\.\w+)+", name):  # a module with parallel_env
-        return PettingZoo(id=_team(name))
+    if re.fullmatch(r"\w+(\.\w+)+", name):
+        with contextlib.suppress(ModuleNotFoundError):  # of what stands before the last dot
+            if importlib.util.find_spec(name):
+                return PettingZoo(id=name)
+        own = ":".join(name.rsplit(".", 1))
+        fail(f"no module {name!r}: a class or function of your own is written {own}")
     if match := re.fullmatch(r"(?:\./)?(\w+)\.py:(\w+)", name):  # a file in place of its module
         fail(f"{name!r} names a file: name its module, {match[1]}:{match[2]}")
+    return _registered(name)
+
+
+def _registered(name: str) -> Any:
+    """A task of Gymnasium's registry; one of a package that registers its own is written
+    package:Id-v0, and the package is imported."""
     import gymnasium
 
     module, _, id = name.rpartition(":")
-    if module:  # package:Name-v0, registered when it is imported
+    if module:
         of_user(name, lambda: importlib.import_module(module))
     if id not in gymnasium.registry:
-        _absent(name, id, gymnasium.registry)
+        if package := CATALOGUE["packages"].get(id.partition("/")[0]):
+            own = f"{package.replace('-', '_')}:{id}"
+            fail(f"{id} is a task of {package}: pip install {package}, then name it {own}")
+        told = "one of your own is written package.module:name"
+        fail(f"no task {name!r}; {told}", name, TASKS, gymnasium.registry)
     return Gymnasium(id=name)
-
-
-def _absent(name: str, id: str, registry: Any) -> None:
-    """Say what was meant by an id that nobody registered."""
-    if package := CATALOGUE["packages"].get(id.partition("/")[0]):
-        module = package.replace("-", "_")
-        fail(f"{id} is a task of {package}: pip install {package}, then name it {module}:{id}")
-    fail(f"no task {name!r}; one of your own is written package.module:name", name, TASKS, registry)
-
-
-def _team(name: str) -> str:
-    """The module of a team; of what is no module, what was meant."""
-    module, _, cls = name.rpartition(".")
-    try:
-        found = importlib.util.find_spec(name)
-    except ModuleNotFoundError:
-        found = None
-    if found is None:
-        fail(f"no module {name!r}: a class or function of your own is written {module}:{cls}")
-    return name
 
 
 def _own(name: str, kwargs: dict[str, Any]) -> Any:
@@ -103,7 +104,8 @@ def _own(name: str, kwargs: dict[str, Any]) -> Any:
 
 
 def require_sound(name: str, env: Any) -> None:
-    """End with what is wrong with a task that is not ours, before anything is trained on it."""
+    """End with what is wrong with a task that is not ours, before anything is trained on it: one of
+    the user's own is checked, one of a package is opened."""
     if ":" in name:
         if found := problems(env):
             say("\n".join(f"- {problem}" for problem in found))
@@ -116,13 +118,12 @@ def require_sound(name: str, env: Any) -> None:
 
 
 def problems(env: Any) -> list[str]:
-    """What `check_environment` finds; an exception of the task's own code is a problem too."""
+    """What `check_environment` finds, a sentence each. An exception of the task's own code is a
+    problem too."""
     try:
         return checks.check_environment(env)
-    except Exception as error:  # the task is somebody else's code: say where, and what often helps
-        own = sys.modules[type(env).__module__].__file__
-        frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == own]
-        where = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+    except Exception as error:  # the task is the user's code: say where, and what often helps
+        where = f" at {place(error)}" if place(error) else ""
         return [
             f"it raised {type(error).__name__}{where}: {first(error)} (everything runs inside JAX: "
             "choose with jnp.where, not `if`; methods are sample(self, *, key) and reward(self, "

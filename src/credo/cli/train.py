@@ -1,9 +1,14 @@
-"""`credo train ALGORITHM TASK`."""
+"""`credo train ALGORITHM TASK`.
+
+A task, a network and an algorithm are made of their words, in this order, and each takes the flags
+of its fields before the next is made of it; then one run is trained, or one for each seed.
+"""
 
 import dataclasses
 import pathlib
 from typing import Any
 
+from .. import require
 from ..runs.ending import say
 from ..runs.options import RunOptions
 from .line import Line
@@ -19,101 +24,132 @@ class Train:
     algorithm: str = ""
     task: str = ""
     _: dataclasses.KW_ONLY
-    network: str | None = None  # one of `credo list networks`; None: the algorithm's own
-    preset: str | None = None  # other settings, of `credo list presets`; None: the published ones
-    delayed: bool = False  # pay the whole return of an episode at its last step
-    from_: str | None = None  # folder of a run whose policy this one starts from; None: of none
-    seed: int = 0  # 0 to 2^32 - 1; everything random follows from it
-    seeds: int = 1  # runs, at least 1, with this seed and the next ones; one process per core
-    path: str | None = None  # the run's folder; None: runs/ALGORITHM-TASK-SEED
+    network: str | None = None
+    """Network of the policy, one of `credo list networks`; of a team one for each agent. None: the
+    algorithm's own."""
+    preset: str | None = None
+    """Settings to start from, one of `credo list presets`. None: the published ones."""
+    delayed: bool = False
+    """Pay the whole return of an episode at its last step, and nothing before."""
+    from_: str | None = None
+    """Warm start: the folder of a run whose policy this one starts from. Task and network must have
+    the same sizes. None: new weights."""
+    seed: int = 0
+    """Seed, 0 to 2^32 - 1. Everything random follows from it: on the same machine it gives the
+    same run."""
+    seeds: int = 1
+    """Number of runs, at least 1, with --seed and the seeds after it. Several have a process each,
+    one per core at a time."""
+    path: pathlib.Path | None = None
+    """Folder of the run, new or empty; of several runs the folder of theirs. None:
+    runs/ALGORITHM-TASK-SEED."""
     kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """NAME=VALUE …: what a task of Gymnasium or PettingZoo is made with."""
+    """NAME=VALUE …: what a task of Gymnasium or PettingZoo is made with, such as g=9.8. Values are
+    read as Python: 8, 0.5, False, None, (1, 2); anything else is a string."""
     rewards: tuple[str, ...] = ()
     """Rewards of the task by name, the first is what training maximises; of a team of PettingZoo
     NAME=MODULE:FUNCTION …, rewards of your own. None given: the task's own."""
-    config: str | None = None  # TOML file with any of these settings; what is typed comes first
-    save_config: str | None = None  # TOML file to write all settings to; None: none
-    print_config: bool = False  # print all settings as TOML and train nothing
-    trust: bool = False  # the file of --config names code of others: import it
+    config: str | None = None
+    """TOML file with any of these settings, as --save-config writes them. What is typed overrides
+    it."""
+    save_config: pathlib.Path | None = None
+    """TOML file to write all settings to, for --config. None: no file."""
+    print_config: bool = False
+    """Print all settings as TOML, and train nothing."""
+    trust: bool = False
+    """Import the code that the file of --config names. Without this such a file is refused: to
+    import a module is to execute it."""
     options: RunOptions = RunOptions()  # noqa: RUF009
 
     def __post_init__(self):
-        if not 0 <= self.seed <= self.seed + max(self.seeds, 1) - 1 < 2**32:
-            last = f" … {self.seed + self.seeds - 1}" if self.seeds > 1 else ""
-            raise ValueError(f"seed is {self.seed}{last}: a seed must lie in 0 … {2**32 - 1}")
-        if self.seeds < 1:
-            raise ValueError(f"seeds is {self.seeds}: it must be at least 1")
+        require_seeds(self.seed, max(self.seeds, 1))
+        require.at_least("seeds", self.seeds, 1)
+
+    def __call__(self, line: Line) -> None:
+        """Train, or show or write the settings; without a task or algorithm, say what is missing.
+        A task that is not ours is checked first."""
+        if self.algorithm and self.algorithm not in ALGORITHMS:
+            fail(f"no algorithm {self.algorithm!r}", self.algorithm, ALGORITHMS)
+        if not (self.task or (line.help and self.algorithm)):
+            if self.algorithm and not line.help:
+                words = f"{self.algorithm} {_examples(self.algorithm)[0]}"
+                say(f"credo: a task is missing, as in credo train {words}\n")
+            line.end()
+        algorithm = _algorithm(line, self)
+        line.done()
+        from . import settings, tasks
+
+        tasks.require_sound(self.task, algorithm.env)
+        text = settings.written(self, algorithm)
+        if self.save_config:
+            self.save_config.write_text(text, "utf-8")
+        if self.print_config:
+            print(text, end="")
+        else:
+            _start(self, algorithm)
 
 
-def run(line: Line) -> None:
-    """Train, or say with which flags."""
-    if files := [values for name, values in line.given if name == "config" and values]:
-        from . import settings
-
-        said = [values for name, values in line.given if name == "trust"]
-        trust = bool(said) and said[-1][:1] in ([], ["True"], ["true"])
-        line.filed = settings.read(files[-1][0], trust=trust)
-        saved = dict(line.filed)
-        words = [*saved.get("algorithm", []), *saved.get("task", [])]
-        line.words, line.used = line.words + words[len(line.words) :], {"algorithm", "task"}
-    command = line.command(Train)
-    if command.algorithm and command.algorithm not in ALGORITHMS:
-        fail(f"no algorithm {command.algorithm!r}", command.algorithm, ALGORITHMS)
-    if not (command.task or (line.help and command.algorithm)):
-        if command.algorithm and not line.help:
-            tasks = {"a team": "rover", "labelled sequences": "sequence-recall"}
-            task = tasks.get(ALGORITHMS[command.algorithm].get("learns", ""), "Hopper-v5")
-            say(f"credo: a task is missing, as in credo train {command.algorithm} {task}\n")
-        line.end()
-    algorithm = _algorithm(line, command)
-    line.done()
-    from . import settings, tasks
-
-    tasks.require_sound(command.task, algorithm.env)
-    text = settings.written(command, algorithm)
-    if command.save_config:
-        pathlib.Path(command.save_config).write_text(text, "utf-8")
-    if command.print_config:
-        print(text, end="")
-    else:
-        _start(command, algorithm)
+def require_seeds(first: int, number: int = 1) -> None:
+    """Raise `ValueError` if one of so many seeds from the first on is not in 0 … 2^32 - 1."""
+    if not 0 <= first <= first + number - 1 < 2**32:
+        last = f" … {first + number - 1}" if number > 1 else ""
+        raise ValueError(f"seed is {first}{last}: a seed must lie in 0 … {2**32 - 1}")
 
 
 def _algorithm(line: Line, command: Train) -> Any:
-    """The algorithm of a task and network, with all that was typed about them."""
-    from . import tasks
-
-    entry, word = ALGORITHMS[command.algorithm], command.algorithm
-    module, _, rest = entry["path"].partition(":")
-    cls, build = load(f"{module}:{rest.partition('.')[0]}"), load(entry["path"])
-    if command.preset:
-        presets = entry.get("presets", ())
-        if command.preset not in presets:
-            what = (
-                f"no preset {command.preset!r} of {word}" if presets else f"{word} has no presets"
-            )
-            fail(what, command.preset, presets)
-        build = cls.presets()[command.preset]
-    line.reserved |= {f.name.replace("_", "-") for f in dataclasses.fields(cls)}
-    line.skipped = {"id"}  # the task is a word
-    example = CATALOGUE["examples"][entry.get("learns", "one agent")]
+    """The algorithm of a task and network, with all that was typed about them. What they raise
+    about their settings, or about one another, ends the command."""
+    word = command.algorithm
+    build, fields = _builder(word, command.preset)
+    line.reserved |= fields
     try:
-        given = (command.task, command.kwargs, command.rewards)
-        env = tasks.task(*given) if command.task else load(example)()
-        env = line.take(env, "env.")
-        if entry.get("learns") == "a team" and env.agents is None:
-            fail(
-                f"{word} trains teams and {command.task} has one agent: give a team (rover, "
-                "simple-spread, mpe2.simple_spread_v3, one of your own), or train erl"
-            )
-        network = _network(line, command.network or entry.get("network"), word, env)
+        env = _task(line, command)
+        network = _network(line, command.network or ALGORITHMS[word].get("network"), word, env)
         if command.delayed:
             from ..environments import wrappers
 
             env = wrappers.delayed(env)
         return line.take(build(env, network))
-    except ValueError as error:  # a task and an algorithm that do not go together
+    except ValueError as error:
         fail(str(error))
+
+
+def _task(line: Line, command: Train) -> Any:
+    """The task, with its flags. Where none is named, as help may be asked for without, it is a
+    small one whose flags are not shown."""
+    from . import tasks
+
+    word = command.algorithm
+    if not command.task:
+        line.skipped = {"env"}
+        line.text += f" Flags of a task are shown with it: credo train {word} TASK --help-all."
+        return load(_examples(word)[1])()
+    line.skipped = {"id"}  # the task is a word
+    env = line.take(tasks.task(command.task, command.kwargs, command.rewards), "env.")
+    if ALGORITHMS[word].get("learns") == "a team" and env.agents is None:
+        fail(
+            f"{word} trains teams and {command.task} has one agent: give a team (rover, "
+            "simple-spread, mpe2.simple_spread_v3, one of your own), or train erl"
+        )
+    return env
+
+
+def _examples(word: str) -> tuple[str, str]:
+    """The name of a task that an algorithm can learn, and where a small one for help is."""
+    return CATALOGUE["examples"][ALGORITHMS[word].get("learns", "one agent")]
+
+
+def _builder(word: str, preset: str | None) -> tuple[Any, set[str]]:
+    """What makes the algorithm of a task and a network, and the names of its fields as flags."""
+    entry = ALGORITHMS[word]
+    module, _, name = entry["path"].partition(":")
+    cls, presets = load(f"{module}:{name.partition('.')[0]}"), entry.get("presets", ())
+    if preset and not presets:
+        fail(f"{word} has no presets")
+    if preset and preset not in presets:
+        fail(f"no preset {preset!r} of {word}", preset, presets)
+    fields = {f.name.replace("_", "-") for f in dataclasses.fields(cls)}
+    return cls.presets()[preset] if preset else load(entry["path"]), fields
 
 
 def _network(line: Line, name: str | None, algorithm: str, env: Any) -> Any:
@@ -131,33 +167,39 @@ def _network(line: Line, name: str | None, algorithm: str, env: Any) -> Any:
 
 
 def _start(command: Train, algorithm: Any) -> None:
-    """One run here, or several in processes of their own."""
+    """One run here, or several in processes of their own; then how far each came, and whether it
+    learned anything by gradient."""
     from ..executors import local
     from ..runs import folder, loop
     from ..runs.store import Run
 
-    frames, learns = command.options.frames, getattr(algorithm, "learners", True)
-    flag = next((x for x in ("start_frames", "warmup_frames") if hasattr(algorithm, x)), "")
-    start = getattr(algorithm, flag, -1)
-    if learns and not command.from_ and frames is not None and frames <= start:
-        say(
-            f"credo: note: nothing is learned by gradient in the first {start:,} frames, and this "
-            f"run ends after {frames:,}: give more --frames, or fewer --{flag.replace('_', '-')}"
-        )
     number = command.seed if command.seeds == 1 else "seeds"
-    path = pathlib.Path(command.path) if command.path else folder.free_name(algorithm, number)
-    seeds = range(command.seed, command.seed + command.seeds)
-    if len(seeds) == 1:
-        given = {"seed": command.seed, "path": path, "warm_start": command.from_}
-        print(loop.train(algorithm, command.options, **given).summary)
-        return
-    local.run(
-        [
-            local.Job(path / f"seed-{seed}", algorithm, seed, command.options, command.from_)
-            for seed in seeds
-        ],
-        again="the same command" + f" with --path {path}" * (not command.path),
-    )
-    for seed in seeds:
-        print(Run(path / f"seed-{seed}").summary)
-    print(f"compare them: credo report {path}/seed-*")
+    path = command.path or folder.free_name(algorithm, number)
+    options, start = command.options, command.from_
+    first, late = _warm_up(algorithm)
+    if not start and options.frames is not None and options.frames <= first:
+        say(f"credo: note: {late}")
+    if command.seeds == 1:
+        runs = [loop.train(algorithm, options, seed=command.seed, path=path, warm_start=start)]
+    else:
+        seeds = range(command.seed, command.seed + command.seeds)
+        jobs = [local.Job(path / f"seed-{n}", algorithm, n, options, start) for n in seeds]
+        local.run(jobs, again="the same command" + f" with --path {path}" * (not command.path))
+        runs = [Run(job.path) for job in jobs]
+    for run in runs:
+        print(run.summary)
+        if late and not run.metrics["updates"].any():
+            say(f"credo: no gradient update was made in {run.path}: {late}")
+    if len(runs) > 1:
+        print(f"compare them: credo report {path}/seed-*")
+
+
+def _warm_up(algorithm: Any) -> tuple[int, str]:
+    """The frames before learning by gradient begins, and a line that says so; -1 and "" for an
+    algorithm that does not learn so, or from the first frame on."""
+    for name in ("start_frames", "warmup_frames"):
+        if hasattr(algorithm, name) and getattr(algorithm, "learners", True):
+            frames, flag = getattr(algorithm, name), name.replace("_", "-")
+            told = f"nothing is learned by gradient in the first {frames:,} frames"
+            return frames, f"{told}: give more --frames, or fewer --{flag}"
+    return -1, ""

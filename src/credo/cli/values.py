@@ -28,13 +28,14 @@ def leaves(kind: Any) -> Iterator[Any]:
 
 
 def typed(kind: Any) -> bool:
-    """Whether values of a type can be typed."""
+    """Whether values of a type can be typed: numbers, words, yes or no, paths, choices, tuples of
+    these, and settings by name."""
     return dict in leaves(kind) or all(k in TYPED for k in leaves(kind))
 
 
 def read(name: str, kind: Any, words: list[str], old: Any, rest: list[str]) -> Any:
     """What was typed for the flag `name`. Settings by name are added to `old` ones; what stands
-    behind a flag that alone says yes goes to `rest`."""
+    behind a flag that alone says yes goes to `rest`. Ends the command if it cannot be read."""
     inside = set(leaves(kind))
     if dict in inside:
         return (old or {}) | pairs(name, words)
@@ -49,6 +50,7 @@ def read(name: str, kind: Any, words: list[str], old: Any, rest: list[str]) -> A
 
 
 def _by_type(name: str, kind: Any, words: list[str]) -> Any:
+    """The value of a plain type, of a tuple of them, or one of a Literal."""
     import tyro
 
     try:
@@ -63,7 +65,7 @@ def _by_type(name: str, kind: Any, words: list[str]) -> Any:
 
 
 def plain(token: str) -> str:
-    """`1e6` is a valid integer."""
+    """`1e6` is a valid integer, `1000000`; anything else stays as it is."""
     whole = re.fullmatch(r"\d+(\.\d+)?e\+?\d+", token) and float(token).is_integer()
     return str(int(float(token))) if whole else token
 
@@ -74,7 +76,8 @@ def split(values: list[str]) -> list[str]:
 
 
 def pairs(flag: str, values: list[str]) -> dict[str, Any]:
-    """`size=8 slippery=False`, or `size 8 slippery False`, by name."""
+    """`size=8 slippery=False`, or `size 8 slippery False`, by name, with values as `literal` reads
+    them. Ends the command if a name is none or has no value."""
     rest, found = list(values), {}
     if not rest:
         fail(f"--{flag} needs settings: --{flag} NAME=VALUE …")
@@ -97,7 +100,7 @@ def literal(text: str) -> Any:
 
 
 def seconds(flag: str, text: str) -> str:
-    """`90s`, `30m` or `2h` in seconds."""
+    """`90s`, `30m` or `2h` in seconds; a number without a letter is in seconds already."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh]?)", text)
     if match is None and text not in ("None", "nan"):
         fail(f"--{flag} is {text!r}: write seconds, minutes or hours as 90s, 30m or 2h")

@@ -31,6 +31,14 @@ LASTING = {
 """Wrappers whose state outlives an episode, by class name, and what to use instead."""
 
 
+def _most_steps(limits: list[int | None], warnings: list[str]) -> int:
+    """The least of the limits that there are; a warning if there is none."""
+    known = [int(limit) for limit in limits if limit is not None]
+    if not known:
+        warnings.append(NO_LIMIT)
+    return min(known, default=MOST_STEPS)
+
+
 class Single:
     """What all copies of a Gymnasium environment have in common, taken from the first.
 
@@ -79,14 +87,13 @@ class Single:
             self._seen = mask is not None and mask.shape == (self.action_size,)
 
     def _limit(self, env: gymnasium.Env, limit: int | None) -> int:
-        limits = [] if limit is None else [limit]
+        """Steps of an episode: the least of the user's limit and of every `TimeLimit` wrapper."""
+        limits = [limit]
         while isinstance(env, gymnasium.Wrapper):
             if isinstance(env, gymnasium.wrappers.TimeLimit):
                 limits.append(env._max_episode_steps)
             env = env.env
-        if not limits:
-            self.warnings.append(NO_LIMIT)
-        return min(limits, default=MOST_STEPS)
+        return _most_steps(limits, self.warnings)
 
     def reset(self, env: gymnasium.Env, seed: int, frame: Any, i: int) -> None:
         """A fresh episode of copy `i`, written to its row of the frame."""
@@ -104,11 +111,8 @@ class Single:
         obs, reward, terminated, truncated, info = result
         self.said[i] = obs
         self._write(obs, frame.obs[i])
-        frame.rewards["reward"][i] = reward if isinstance(reward, (float, int)) else _number(reward)
-        if terminated is not True and terminated is not False:
-            terminated = _flag("terminated", terminated)
-        if truncated is not True and truncated is not False:
-            truncated = _flag("truncated", truncated)
+        frame.rewards["reward"][i] = _number(reward)
+        terminated, truncated = _flag("terminated", terminated), _flag("truncated", truncated)
         frame.terminated[i], frame.truncated[i] = terminated, truncated
         over = terminated or truncated
         if self.discrete and not over:
@@ -134,6 +138,7 @@ class Single:
         self._masks[i] = mask.astype(bool)
 
     def _allowed(self, actions: np.ndarray) -> np.ndarray:
+        """The copies' own actions for `[n, act]`, of those that their masks allow."""
         if self._masks:
             actions = actions.copy()
             for i, mask in self._masks.items():
@@ -196,11 +201,7 @@ class Team:
 
     def _cycles(self, env: Any, limit: int | None) -> int:
         """PettingZoo has no wrapper for time limits; `max_cycles` is its custom."""
-        limits = [limit, getattr(env.unwrapped, "max_cycles", None)]
-        limits = [int(limit) for limit in limits if limit is not None]
-        if not limits:
-            self.warnings.append(NO_LIMIT)
-        return min(limits, default=MOST_STEPS)
+        return _most_steps([limit, getattr(env.unwrapped, "max_cycles", None)], self.warnings)
 
     def _first_step(self, env: Any) -> tuple[list[str], Any, Any]:
         """Who acted in a first step with the middle of every Box, their rewards and infos."""
@@ -252,12 +253,14 @@ class Team:
         return not here
 
     def _here(self, env: Any) -> list[str]:
+        """Agents that are in the episode now; `Fault` of one that is no possible agent."""
         strangers = [name for name in env.agents if name not in self._rows]
         if strangers:
             raise Fault(f"has the agent {strangers[0]!r}", "name every agent in possible_agents")
         return list(env.agents)  # a copy: some environments change theirs
 
     def _write(self, obs: Any, names: list[str], frame: Any, i: int) -> None:
+        """Observations of these agents, each to its row of copy `i`; the others stay 0."""
         for name in names:
             k = self._rows[name]
             size, write = self._writes[k]
@@ -313,6 +316,8 @@ class _Pay:
             self._call(name, pay(env, dict(rewards), dict(infos)), paid[name], i)
 
     def _read(self, acted: list[str], infos: Any, paid: dict[str, Any], i: int) -> None:
+        """Rewards that the infos of all who acted name, written to copy `i`: a private one of each
+        agent, a shared one of any, as long as no two of them differ."""
         common: dict[str, Any] = {}
         for agent in acted:
             said = _named(infos, agent)
@@ -342,6 +347,8 @@ class _Pay:
                 paid[name][i] = common[name]
 
     def _call(self, name: str, said: Any, paid: np.ndarray, i: int) -> None:
+        """A reward that a function of the task pays, written to copy `i`: one number, or a dict by
+        agent."""
         if isinstance(said, Mapping) != self._private[name]:
             kinds = "a dict by agent" if self._private[name] else "one number"
             raise Fault(
@@ -402,6 +409,7 @@ def _said(what: str, said: Any, name: str) -> Any:
 
 
 def _box(name: str, space: gymnasium.Space) -> None:
+    """Raise `Fault` unless the action space of an agent is a Box."""
     if not isinstance(space, gymnasium.spaces.Box):
         raise Fault(
             f"has the action space {space} for {name!r}",
@@ -411,6 +419,8 @@ def _box(name: str, space: gymnasium.Space) -> None:
 
 
 def _registered(id: str, kwargs: dict[str, Any], max_episode_steps: int | None) -> gymnasium.Env:
+    """One environment of an id in Gymnasium's registry; the module of its class is imported first,
+    so that MuJoCo is there to be heard."""
     with warnings.catch_warnings():  # -v4 tasks are asked for on purpose
         warnings.filterwarnings("ignore", r".*is out of date", DeprecationWarning)
         try:
@@ -436,6 +446,7 @@ def _hear_mujoco() -> None:
 
 @functools.cache  # each once
 def _tell(warning: str) -> None:
+    """Print a warning of MuJoCo to the error stream."""
     if "'settotalmass' is deprecated" not in warning:  # in Gymnasium's half_cheetah.xml
         print(f"MuJoCo: {warning}", file=sys.stderr)
 
@@ -473,6 +484,8 @@ class _Flat(NamedTuple):
 
 
 def _flat(space: gymnasium.Space, said: str = "an observation") -> _Flat:
+    """How observations of `space` become a row. `said` names them in a `Fault`, which is raised of
+    a space that NumPy cannot hold (Graph, Sequence)."""
     spaces = gymnasium.spaces
     if not (isinstance(space, gymnasium.Space) and space.is_np_flattenable):
         raise Fault(
@@ -560,11 +573,13 @@ def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
 
 
 def _kind(x: Any) -> str:
+    """Type and length of what was returned, for a message."""
     length = f" and length {len(x)}" if isinstance(x, (tuple, list)) else ""
     return f"type {type(x).__name__}{length}"
 
 
 def _padded(flat: _Flat, size: int) -> list[Any]:
+    """Bounds of an agent's observation that is padded with zeros to `size` numbers."""
     pad = (0, size - flat.size)
     return flat._replace(low=np.pad(flat.low, pad), high=np.pad(flat.high, pad)).bounds
 
@@ -613,6 +628,7 @@ def _actions(space: gymnasium.Space) -> tuple[int, Callable[[np.ndarray], np.nda
 
 
 def _count(result: Any, n: int, where: str, parts: str) -> None:
+    """Raise `Fault` unless `result` is a tuple of `n`; `parts` says of what."""
     if not (isinstance(result, tuple) and len(result) == n):
         count = f"{len(result)} values" if isinstance(result, tuple) else type(result).__name__
         raise Fault(f"returned {count} from {where}", f"return {parts}")

@@ -13,14 +13,9 @@ from ..types import Sequence, TimeStep, Trace
 from .viewer import Mark, Viewer
 
 
-class AbstractEnvironment(eqx.Module):
-    """One episode of one task as two pure functions.
-
-    No automatic reset and no batch axis: rollouts decide when to stop, `jax.vmap` decides how
-    many. Observations are finite float32; actions lie in [-1, 1]. For a team both have a leading
-    agent axis and `agents` says how many. The attributes below are class variables, fields with
-    a default, or properties.
-    """
+class AbstractTask(eqx.Module):
+    """What every task says of itself, in JAX or outside. The attributes below are class variables,
+    fields with a default, or properties."""
 
     if TYPE_CHECKING:  # a type checker would take an AbstractVar for a field
         obs_size: ClassVar[int]
@@ -35,8 +30,8 @@ class AbstractEnvironment(eqx.Module):
         """Names of the rewards. The first is what training maximises, unless an algorithm says
         otherwise; the last is what is reported, unless the task does."""
     agents: ClassVar[int | None] = None
-    discrete: ClassVar[bool] = False
-    obs_range: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
+    discrete: ClassVar[bool] = False  # the largest of an action's entries is taken
+    obs_range: ClassVar[tuple[Any, Any]] = (-math.inf, math.inf)
     """The least and the largest number in an observation."""
 
     @property
@@ -45,13 +40,9 @@ class AbstractEnvironment(eqx.Module):
         return self.signals[-1]
 
     @property
-    def unwrapped(self) -> "AbstractEnvironment":
+    def unwrapped(self) -> Any:
         """The task itself, within whatever delays its rewards, adds noise or cuts it short."""
         return self
-
-    def bare(self, state: PyTree) -> PyTree:
-        """Of a state of this task that of `unwrapped`."""
-        return state
 
     def viewer(self) -> Viewer | None:
         """How a page draws its episodes; None: it does not. A task that draws its state in
@@ -64,6 +55,19 @@ class AbstractEnvironment(eqx.Module):
         and learners are made for."""
         team = () if self.agents is None else (self.agents,)
         return self.obs_size, self.action_size, *team
+
+
+class AbstractEnvironment(AbstractTask):
+    """One episode of one task as two pure functions.
+
+    No automatic reset and no batch axis: rollouts decide when to stop, `jax.vmap` decides how
+    many. Observations are finite float32; actions lie in [-1, 1]. For a team both have a leading
+    agent axis and `agents` says how many.
+    """
+
+    def bare(self, state: PyTree) -> PyTree:
+        """Of a state of this task that of `unwrapped`."""
+        return state
 
     @abc.abstractmethod
     def reset(self, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
@@ -89,6 +93,8 @@ SEQUENCE_MARKS = (
 
 
 class SequenceState(eqx.Module):
+    """A sequence between two steps."""
+
     sequence: Sequence
     step: Int[Array, ""]
     perfect: Bool[Array, ""]  # every scored answer so far was right
@@ -97,7 +103,7 @@ class SequenceState(eqx.Module):
 class AbstractSequenceTask(AbstractEnvironment):
     """Read a sequence, answer at each step with one number in [-1, 1].
 
-    A task says how to `sample` a labelled sequence and what an answer earns; the environment
+    A task says how to `sample` a labelled sequence and what an answer is worth; the environment
     below and the fast path of `rollout.evaluate` both follow from that.
     Signals: `fitness`, the sum of `reward` over all steps before the padding; `accuracy`, the
     share of the scored answers that were right; and `success`, 1 at the last step if all were.
@@ -120,7 +126,7 @@ class AbstractSequenceTask(AbstractEnvironment):
         scored: Bool[Array, "*batch"],
         perfect: Bool[Array, "*batch"],
     ) -> Float[Array, "*batch"]:
-        """What one answer earns, elementwise. `perfect`: every scored answer of this sequence
+        """What one answer is worth, elementwise. `perfect`: every scored answer of this sequence
         was right, this one included."""
 
     def lesson(self, sequence: Sequence) -> tuple[Float[Array, " time"], Float[Array, " time"]]:

@@ -60,6 +60,7 @@ def examine(env: AbstractEnvironment | AbstractHostEnvironment) -> tuple[list[st
 
 
 def _spec(env: AbstractEnvironment | AbstractHostEnvironment) -> list[str]:
+    """Sizes, names of rewards and range, before anything is played."""
     problems = [
         f"{name} is {getattr(env, name)!r}: it must be a Python int of at least 1"
         for name in ("obs_size", "action_size", "max_steps", "agents")
@@ -77,6 +78,7 @@ def _spec(env: AbstractEnvironment | AbstractHostEnvironment) -> list[str]:
 
 
 def _reset_and_step(env: AbstractEnvironment) -> list[str]:
+    """Form and content of the first two time steps, without `jit`."""
     state, first = env.reset(key=jax.random.key(0))
     problems = _time_step(env, "reset", first)
     if problems:
@@ -95,6 +97,7 @@ def _reset_and_step(env: AbstractEnvironment) -> list[str]:
 
 
 def _time_step(env: AbstractEnvironment, where: str, time_step: TimeStep) -> list[str]:
+    """Problems of one time step in JAX: types, shapes, dtypes, and the rewards that it names."""
     if not isinstance(time_step, TimeStep):
         return [f"{where}: the second result is {type(time_step).__name__}: return a TimeStep"]
     team = () if env.agents is None else (env.agents,)
@@ -110,14 +113,12 @@ def _time_step(env: AbstractEnvironment, where: str, time_step: TimeStep) -> lis
         problems += _array(f"{where}: reward {name!r}", reward, shape, np.float32)
     for name in ("terminated", "truncated"):
         problems += _array(f"{where}: {name}", getattr(time_step, name), (), np.bool_)
-    if time_step.active is not None:
-        if not team:
-            problems.append(f"{where}: active is for teams: leave it None, or set agents")
-        problems += _array(f"{where}: active", time_step.active, team, np.bool_)
-    if time_step.gone is not None:
-        if not team:
-            problems.append(f"{where}: gone is for teams: leave it None, or set agents")
-        problems += _array(f"{where}: gone", time_step.gone, team, np.bool_)
+    for name in ("active", "gone"):
+        said = getattr(time_step, name)
+        if said is not None:
+            if not team:
+                problems.append(f"{where}: {name} is for teams: leave it None, or set agents")
+            problems += _array(f"{where}: {name}", said, team, np.bool_)
     return problems
 
 
@@ -153,6 +154,7 @@ def _same_structure(reset: PyTree, step: PyTree) -> list[str]:
 
 
 def _form(x) -> str:
+    """Dtype and shape, as in float32[3]."""
     return f"{jnp.result_type(x)}{list(np.shape(x))}"
 
 
@@ -178,6 +180,7 @@ def _repeatable(env: AbstractEnvironment) -> list[str]:
 
 
 def _episodes(env: AbstractEnvironment) -> list[str]:
+    """Whether 16 whole episodes stay finite and within range, end in time, and differ."""
     played = jax.jit(jax.vmap(lambda key: _play(env, key)))(
         jax.random.split(jax.random.key(0), KEYS)
     )
@@ -415,6 +418,7 @@ class _Look:
             )
 
     def _look(self, step: HostStep, active: np.ndarray, t: int, seen: list[list[bytes]]) -> None:
+        """Problems of step `t`, and what it said, for the comparison of episodes."""
         self._failures(step.failed)
         self.problems += _host_step(self.env, step, active)
         self.steps += int(active.sum())
@@ -446,6 +450,7 @@ class _Look:
 
 
 def _host_step(env: AbstractHostEnvironment, step: HostStep, active: np.ndarray) -> list[str]:
+    """Problems of one step of all copies outside JAX."""
     n, (obs_size, _, *team) = len(active), env.sizes
     dtype = np.dtype(env.obs_dtype).type
     problems = _numbers("step: obs", step.obs, (n, *team, obs_size), dtype, active)

@@ -98,6 +98,7 @@ class ExtendedTMaze(AbstractEnvironment):
 
     obs_size: ClassVar[int] = 3
     action_size: ClassVar[int] = 1
+    reported: ClassVar[str] = "score"
 
     depth: int = eqx.field(static=True, default=2)  # junctions on the way, 1..24
     robots: int = eqx.field(static=True, default=1)  # robots that learn, at least 1
@@ -123,13 +124,7 @@ class ExtendedTMaze(AbstractEnvironment):
     def __check_init__(self):
         require.within("depth", self.depth, 1, DEEPEST)
         require.at_least("robots", self.robots, 1)
-        require.choice("objective", self.objective, ("converge", "spread"))
-        if self.partner is not None:
-            require.choice("partner", self.partner, ("fsp", "resp"))
-        require.choice("presence", self.presence, ("others", "as-coded"))
-        require.choice("feedback", self.feedback, ("objective", "own"))
-        require.choice("moves", self.moves, ("uniform", "as-coded"))
-        require.choice("counterfactual", self.counterfactual, ("absent", "random"))
+        require.literals(self)
         if len(self.corridor) != 2 or not 1 <= self.corridor[0] <= self.corridor[1]:
             raise ValueError(
                 f"corridor is {self.corridor}: give (shortest, longest) in steps, at least 1 each, "
@@ -148,10 +143,12 @@ class ExtendedTMaze(AbstractEnvironment):
 
     @property
     def endpoints(self) -> int:
+        """Where the paths end, numbered from 0."""
         return 2**self.depth
 
     @property
     def trials(self) -> int:
+        """Walks from the start to an endpoint in one episode."""
         return 3 * self.endpoints
 
     @property
@@ -161,10 +158,6 @@ class ExtendedTMaze(AbstractEnvironment):
     @property
     def signals(self) -> tuple[str, ...]:
         return (*self.rewards, "shaped") if self.shaping else self.rewards
-
-    @property
-    def reported(self) -> str:
-        return "score"
 
     @property
     def obs_range(self) -> tuple[float, float]:
@@ -250,16 +243,16 @@ class ExtendedTMaze(AbstractEnvironment):
             "maze",
             f"{robots}{beside}, {self.depth}-deep, {self.objective.capitalize()}: the reward is "
             f"observed if {rule} at its endpoint.",
-            self._shown,
+            self.shown,
             {"depth": self.depth},
             tuple(mark for mark in marks if self.partner or mark.text != "static robot"),
             agent="robot",
         )
 
-    def _shown(self, trace: Trace) -> dict[str, Any]:
-        """At every moment: the trial, how far everybody is on the way (`part` of the corridor
+    def shown(self, trace: Trace) -> dict[str, Any]:
+        """At every moment: the trial, how far each robot is on the way (`part` of the corridor
         behind `level` turns, of which `turns` has the bits), and where the static robot goes; for
-        every trial where everybody went, and what they were told."""
+        every trial where each robot went (`static`: the static one), and what they were told."""
         state = trace.states
         ends = np.flatnonzero(np.diff(state.trial)) + 1  # moments at which a trial is over
         over = np.isin(np.arange(len(state.trial)), ends)
@@ -291,6 +284,7 @@ class ExtendedTMaze(AbstractEnvironment):
         return shown
 
     def _goals(self, key: PRNGKeyArray) -> Int[Array, " 3"]:
+        """Endpoints of the reward in the three thirds of the trials."""
         n = self.endpoints
         first_key, *move_keys = jax.random.split(key, 3)
         goals = [jax.random.randint(first_key, (), 0, n)]
@@ -308,6 +302,7 @@ class ExtendedTMaze(AbstractEnvironment):
         return self.corridor[0] if state.lengths is None else state.lengths[junction]
 
     def _company(self, everybody: Int[Array, " team"]) -> Bool[Array, " robots"]:
+        """Which robots are told that they were not alone at their endpoint."""
         if self.presence == "as-coded":
             return jnp.broadcast_to(jnp.all(everybody == everybody[0]), self.robots)
         same = everybody[: self.robots, None] == everybody[None]
@@ -351,6 +346,7 @@ class ExtendedTMaze(AbstractEnvironment):
         there: Bool[Array, " robots"],
         arrived: Bool[Array, ""],
     ) -> Int[Array, "robots endpoints"] | None:
+        """The last visits to each endpoint, after this step; None without `shaping`."""
         if state.visited is None:
             return None
         here = endpoint[:, None] == jnp.arange(self.endpoints)[None]

@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import numpy as np
 
+from .. import require
 from . import names, processes, worker
 from .host import (
     AbstractCopies,
@@ -34,9 +35,15 @@ def _pairs(kwargs: Any) -> Any:
 
 
 def _plain(value: Any) -> bool:
+    """Whether JSON and a hash can hold it."""
     if isinstance(value, tuple):
         return all(_plain(item) for item in value)
     return value is None or isinstance(value, str | int | float)
+
+
+def _size(name: str) -> Any:
+    """A property that only the environment itself can tell."""
+    return property(lambda self: self._sizes()[name])
 
 
 class AbstractForeignEnvironment(AbstractHostEnvironment):
@@ -67,35 +74,19 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
                 f"kwargs is {self.kwargs!r}: it must be pairs (name, value) or a dict, and a value "
                 "a number, a string, a bool, None or a tuple of these, so that a run can record it"
             )
-        limit = self.max_episode_steps
-        if limit is not None and limit < 1:
-            raise ValueError(f"max_episode_steps is {limit}: it must be at least 1, or None")
+        require.at_least("max_episode_steps", self.max_episode_steps, 1)
+        require.at_least("at_once", self.at_once, 1)
         if not 0 <= self.tolerated <= 1:
             raise ValueError(f"tolerated is {self.tolerated}: it must be a share, from 0 to 1")
-        if self.at_once is not None and self.at_once < 1:
-            raise ValueError(f"at_once is {self.at_once}: it must be at least 1, or None")
         if not self.timeout > 0:
             raise ValueError(f"timeout is {self.timeout}: it must be more than 0 seconds")
 
-    @property
-    def obs_size(self) -> int:
-        return self._sizes()["obs_size"]
-
-    @property
-    def action_size(self) -> int:
-        return self._sizes()["action_size"]
-
-    @property
-    def max_steps(self) -> int:
-        return self._sizes()["max_steps"]
-
-    @property
-    def obs_dtype(self) -> str:
-        return self._sizes()["obs_dtype"]
-
-    @property
-    def discrete(self) -> bool:
-        return bool(self._sizes()["discrete"])
+    obs_size = _size("obs_size")
+    action_size = _size("action_size")
+    max_steps = _size("max_steps")
+    obs_dtype = _size("obs_dtype")
+    agents = _size("agents")
+    discrete = _size("discrete")
 
     def spec(self) -> dict[str, Any]:
         """What a worker must know to open it, as JSON has it."""
@@ -169,6 +160,7 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
         return tuple(self._sizes()["warnings"])
 
     def _warn(self) -> None:
+        """Warn of what users should know, once for each task and process."""
         if self not in _WARNED:
             _WARNED.add(self)
             for told in self.warnings:
@@ -200,6 +192,9 @@ class ForeignCopies(AbstractCopies):
         _ALL.add(self)
 
     def _opened(self) -> worker.Environments | worker.Process:
+        """The worker that plays the copies, started where there is none.
+
+        **Raises:** `UnfitEnvironment` if the environment cannot be opened as this task."""
         if self._backend is None:
             env, spec = self._env, self._env.spec()
             processes.allow()
@@ -221,6 +216,7 @@ class ForeignCopies(AbstractCopies):
 
     @property
     def usable(self) -> bool:
+        """Whether these copies can be reset: not closed, and no call was interrupted."""
         return not self._closed and (self._backend is None or self._backend.usable)
 
     @property
@@ -229,6 +225,7 @@ class ForeignCopies(AbstractCopies):
         return sum(map(bool, self._recent))
 
     def failure_text(self, i: int) -> str:
+        """What went wrong, in which copy, at which step, with which seed, and what to do."""
         return self._whys.get(i, "unknown")
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
@@ -325,7 +322,7 @@ class ForeignCopies(AbstractCopies):
     def _say(self, why: str) -> None:
         """The first, tenth, hundredth … failure, on the error stream."""
         if self._env.tolerated and math.log10(self._discarded).is_integer():
-            with contextlib.suppress(OSError, ValueError):  # nobody reads it
+            with contextlib.suppress(OSError, ValueError):  # it is not read any more
                 print(
                     f"credo: {self._discarded:,} episode{'s' * (self._discarded > 1)} failed and "
                     f"left out, now: {why}. The run ends if more than {self._env.tolerated:.0%} of "
@@ -350,6 +347,7 @@ class ForeignCopies(AbstractCopies):
 
 
 def _form(x: np.ndarray, shape: tuple[int, ...], dtype: type) -> np.ndarray:
+    """An array of this dtype; `ValueError` if its shape is another one."""
     x = np.asarray(x, dtype)
     if x.shape != shape:
         raise ValueError(f"an array of shape {x.shape} was given: it must be {shape}")

@@ -111,4 +111,5 @@ class Gymnasium(AbstractForeignEnvironment):
     registered is registered in the worker too. What no other process can import, such as a class
     of a notebook, is played in this process, and its runs can be resumed there alone."""
     api: ClassVar[str] = "gymnasium"
+    agents: ClassVar[None] = None
     signals: ClassVar[tuple[str, ...]] = ("reward",)

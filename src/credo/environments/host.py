@@ -3,14 +3,13 @@
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt32
 
-from .viewer import Viewer
+from .base import AbstractTask
 
 
 class EnvironmentFailure(RuntimeError):
@@ -119,6 +118,7 @@ class InTurn(AbstractCopies):
         return now
 
     def failure_text(self, i: int) -> str:
+        """By the number of the copy, not of its seat."""
         return self._whys.get(i, "unknown")
 
     def _some(self, x: np.ndarray) -> np.ndarray:
@@ -128,11 +128,13 @@ class InTurn(AbstractCopies):
         return some
 
     def _all(self, x: np.ndarray) -> np.ndarray:
+        """What those who play say, in rows of all copies; the others have zeros."""
         rows = np.zeros((self.n, *x.shape[1:]), x.dtype)
         rows[self._seats] = x[: self._seats.size]
         return rows
 
     def _keep(self, failed: np.ndarray | None) -> None:
+        """Remember why copies failed, by their own numbers."""
         for seat, lane in enumerate(self._seats.tolist()):
             if failed is not None and failed[lane]:
                 self._whys[lane] = self.inner.failure_text(seat)
@@ -147,26 +149,10 @@ def sound(env: Any, returns: Any) -> Any:
     return returns if kept.all() or not kept.any() else np.asarray(returns)[kept]
 
 
-class AbstractHostEnvironment(eqx.Module):
+class AbstractHostEnvironment(AbstractTask):
     """A task outside JAX: a config compared by value, whose `copies` play it."""
 
-    if TYPE_CHECKING:  # a type checker would take an AbstractVar for a field
-        obs_size: ClassVar[int]
-        action_size: ClassVar[int]
-        max_steps: ClassVar[int]
-        signals: ClassVar[tuple[str, ...]]
-    else:
-        obs_size: eqx.AbstractVar[int]
-        action_size: eqx.AbstractVar[int]
-        max_steps: eqx.AbstractVar[int]  # no episode is longer
-        signals: eqx.AbstractVar[tuple[str, ...]]  # names of the rewards, as in a JAX task
-    agents: ClassVar[int | None] = None
-    discrete: ClassVar[bool] = False  # the largest of an action's entries is taken
     obs_dtype: ClassVar[str] = "float32"  # or "uint8"
-    if TYPE_CHECKING:
-        obs_range: ClassVar[tuple[Any, Any]]
-    else:
-        obs_range = (-np.inf, np.inf)  # the least and the largest of the observed numbers
     warnings: ClassVar[tuple[str, ...]] = ()  # what its users should know
 
     @property
@@ -178,26 +164,6 @@ class AbstractHostEnvironment(eqx.Module):
         """Who of the active copies plays together, in order: all, or `at_once` at a time."""
         turn = (np.cumsum(active) - 1) // (self.at_once or active.size)
         return [active & (turn == k) for k in range(max(turn.max(), 0) + 1)]
-
-    @property
-    def reported(self) -> str:
-        """The reward signal by which a champion is judged."""
-        return self.signals[-1]
-
-    @property
-    def unwrapped(self) -> "AbstractHostEnvironment":
-        """The task itself, within whatever delays its rewards."""
-        return self
-
-    def viewer(self) -> Viewer | None:
-        """How a page draws its episodes; None: it does not."""
-        return None
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """As of a JAX task: numbers in an observation and in an action, of a team the agents."""
-        team = () if self.agents is None else (self.agents,)
-        return self.obs_size, self.action_size, *team
 
     @property
     def reward_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -284,6 +250,7 @@ class Episodes:
         return jax.tree.map(kept, *self._rows)
 
     def returns(self) -> dict[str, Float[np.ndarray, "n *agents"]]:
+        """Sum of every reward in each episode; NaN of one that is lost."""
         for total in self._sums.values():
             total[self._lost] = np.nan
         return self._sums

@@ -21,7 +21,7 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import WrapperSpec
 
-OWN_TEAMS = ("pettingzoo.", "mpe2.")  # modules of teams that are nobody's own code
+OWN_TEAMS = ("pettingzoo.", "mpe2.")  # modules of teams that are no user's own code
 ALONE = "name the module, as in mine:{}, or set in_process=True"
 
 _HERE: dict[str, Any] = {}  # what no other process can import, by the name that it got here
@@ -70,6 +70,7 @@ def here_alone(name: str) -> bool:
 
 
 def _nameable(thing: Any) -> bool:
+    """Whether it is a class or a plain Python function."""
     return isinstance(thing, type) or inspect.isfunction(thing)
 
 
@@ -164,7 +165,7 @@ def kind_of(name: str, kwargs: Mapping[str, Any] | None = None) -> str | None:
         if not isinstance(made, type) or made is inspect.Signature.empty:
             env = maker(**(kwargs or {}))
             made = type(env)
-            with contextlib.suppress(Exception):  # nobody needs it any more
+            with contextlib.suppress(Exception):  # it is not needed any more
                 env.close()
     bases = getattr(made, "__mro__", ())
     if gymnasium.Env in bases:
@@ -197,6 +198,7 @@ def foreign_code(api: str, id: str, kwargs: Mapping[str, Any]) -> str | None:
 
 
 def _own(spec: Any) -> bool:
+    """Whether entry point and wrappers of a registered environment are Gymnasium's or Credo's."""
     entries = [spec.entry_point, *(w.entry_point for w in spec.additional_wrappers)]
     modules = [x if isinstance(x, str) else getattr(x, "__module__", "") for x in entries]
     return all(module.startswith(("gymnasium.", "credo.")) for module in modules)
@@ -238,6 +240,7 @@ def register(told: dict[str, Any] | None) -> None:
 
 
 def _json(value: Any) -> bool:
+    """Whether JSON can hold it."""
     try:
         json.dumps(value)
     except (TypeError, ValueError):

@@ -42,7 +42,7 @@ class PettingZoo(AbstractForeignEnvironment):
     Every agent of `possible_agents` has a row, in that order. Observations are flattened as in
     `Gymnasium`, and padded with zeros to the largest of the team. An action is as long as the
     largest of the team; each agent is given as much of it as its own Box holds, scaled so that -1
-    is its low and 1 its high. Who is not there observes 0, earns 0, and its action is ignored.
+    is its low and 1 its high. Who is not there observes 0, is paid 0, and its action is ignored.
 
     Rewards: `local` `[agents]`, what the environment pays each agent, and `global`, its mean over
     all rows, unless the task names its own: in `info["rewards"]`, a dict of every agent that acted
@@ -62,6 +62,7 @@ class PettingZoo(AbstractForeignEnvironment):
     that PettingZoo knows). Where it takes continuous_actions, that is True unless `kwargs` says
     otherwise."""
     api: ClassVar[str] = "pettingzoo"
+    reported: ClassVar[str] = "global"
     rewards: tuple[tuple[str, str], ...] = eqx.field(static=True, default=(), converter=_makers)
     """Who pays the reward of a name: {"global": arrived}, and `arrived(env, rewards, infos)`
     returns one number for the team, or a dict by agent of a private reward. It is given the
@@ -86,16 +87,8 @@ class PettingZoo(AbstractForeignEnvironment):
         return tuple(name for name, _ in self._sizes()["signals"])
 
     @property
-    def reported(self) -> str:
-        return "global"
-
-    @property
-    def agents(self) -> int:
-        return self._sizes()["agents"]
-
-    @property
     def reward_shapes(self) -> dict[str, tuple[int, ...]]:
-        team = (self.agents,)
+        team = (self._sizes()["agents"],)
         return {name: team if private else () for name, private in self._sizes()["signals"]}
 
 
@@ -192,6 +185,7 @@ class ParallelTeam(ParallelEnv):
         return np.asarray(env.render(self._state))
 
     def _infos(self) -> dict[str, dict[str, Any]]:
+        """All rewards of each agent, and whether it acts at the next step."""
         n = len(self.possible_agents)
         rewards = {
             name: np.broadcast_to(np.asarray(reward), n).tolist()
@@ -206,6 +200,7 @@ class ParallelTeam(ParallelEnv):
         return self._by_agent(infos)
 
     def _by_agent(self, rows: Any) -> dict[str, Any]:
+        """One of the rows for each agent."""
         return dict(zip(self.possible_agents, rows, strict=True))
 
 

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from .. import require
 from ..types import Sequence, TimeStep
 from .base import AbstractEnvironment, AbstractSequenceTask
 
@@ -30,7 +31,7 @@ class Copy(AbstractEnvironment):
     """Act as you see: the reward is minus the squared distance of action and observation.
 
     Each observation is uniform in [-1, 1], independent of all before it and of the actions. The
-    clock ends the episode (truncated). Best return 0; the action 0 earns -size·max_steps/3 on
+    clock ends the episode (truncated). Best return 0; the action 0 has -size·max_steps/3 on
     average.
     """
 
@@ -41,10 +42,8 @@ class Copy(AbstractEnvironment):
     max_steps: int = eqx.field(static=True, default=10)  # length of every episode, at least 1
 
     def __check_init__(self):
-        if self.size < 1 or self.max_steps < 1:
-            raise ValueError(
-                f"size is {self.size} and max_steps is {self.max_steps}: both must be at least 1"
-            )
+        require.at_least("size", self.size, 1)
+        require.at_least("max_steps", self.max_steps, 1)
 
     @property
     def obs_size(self) -> int:
@@ -77,15 +76,12 @@ class Remember(AbstractSequenceTask):
 
     obs_range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
 
+    obs_size: ClassVar[int] = 1
+
     delay: int = eqx.field(static=True, default=5)  # steps the signal must be kept, at least 1
 
     def __check_init__(self):
-        if self.delay < 1:
-            raise ValueError(f"delay is {self.delay}: it must be at least 1 step")
-
-    @property
-    def obs_size(self) -> int:
-        return 1
+        require.at_least("delay", self.delay, 1)
 
     @property
     def max_steps(self) -> int:
@@ -97,13 +93,7 @@ class Remember(AbstractSequenceTask):
         inputs = jnp.zeros((self.max_steps, 1)).at[0, 0].set(signal)
         return Sequence(inputs, jnp.where(last, signal, 0.0), last, jnp.int32(self.max_steps))
 
-    def reward(
-        self,
-        answer: Float[Array, "*b"],
-        target: Float[Array, "*b"],
-        scored: Bool[Array, "*b"],
-        perfect: Bool[Array, "*b"],
-    ) -> Float[Array, "*b"]:
+    def reward(self, answer, target, scored, perfect):
         return jnp.where(scored, answer * target, 0.0)
 
 

@@ -25,7 +25,7 @@ PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 LONGEST = 5.0  # seconds that a guardian gets to kill what it guards
 MULTIPLYING = "put it under if __name__ == '__main__'"
 
-_worker = False  # whether this process is somebody's child, started here
+_worker = False  # whether this process is a child, started here
 _forked = False  # whether it was forked from one in which JAX has threads
 
 
@@ -59,6 +59,7 @@ def allow(doing: str = "starts training") -> None:
 
 
 def _after_fork() -> None:
+    """Note in a fork whether JAX had been used, whose threads do not come along."""
     global _forked
     bridge = sys.modules.get("jax._src.xla_bridge")
     _forked = bool(getattr(bridge, "_backends", None))
@@ -115,6 +116,7 @@ class Child(subprocess.Popen):
 
 
 def _pidfd(pid: int) -> int | None:
+    """A descriptor that becomes readable when the process ends; None if there is no such thing."""
     if not hasattr(os, "pidfd_open"):
         return None
     with contextlib.suppress(OSError):
@@ -193,6 +195,8 @@ def _wait(worker: int, parent: int, wake: int, grace: float) -> int:
         for pid, status in _ended():
             if pid == worker:
                 return status
+        if deadline is not None and signal.SIGTERM in told:
+            deadline = time.monotonic()  # told twice: at once
         if deadline is None and (signal.SIGTERM in told or os.getppid() != parent):
             deadline = time.monotonic() + grace
             if gone is not None:
@@ -214,11 +218,12 @@ def _ended() -> list[tuple[int, int]]:
 
 
 def _kill_all(worker: int) -> None:
+    """Kill the child, its group, and on Linux all that they started, until they are gone."""
     with contextlib.suppress(OSError):
         os.killpg(worker, signal.SIGKILL)
     children = pathlib.Path(f"/proc/self/task/{os.getpid()}/children")
     while children.exists():
-        # Whose parent is killed comes here, so that in the end nobody is left.
+        # Whose parent is killed comes here, so that in the end none is left.
         left = children.read_text().split()
         for pid in left:
             with contextlib.suppress(OSError):

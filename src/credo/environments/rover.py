@@ -23,7 +23,7 @@ of harvesting in total, here they are consecutive.
 """
 
 import math
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -68,7 +68,7 @@ Point = tuple[float, float]
 
 
 class RoverState(eqx.Module):
-    """A world between two steps. The ledgers of the rewards are None where nobody asked for them.
+    """A world between two steps. The ledgers of rewards that are not paid are None.
 
     "Without i": had rover i never been there, all else equal.
     """
@@ -98,12 +98,12 @@ class Rover(AbstractEnvironment):
 
     **Observation** `"relative"` `[rovers, 72]`. Index b = 0..35: the closest other rover whose
     direction lies in [10b°, 10b+10°), anticlockwise from the own heading; 36 + b: the closest
-    unobserved POI there. The value is 1/(1+d) at a distance of d metres, in [0, 1]; 0: nobody.
+    unobserved POI there. The value is 1/(1+d) at a distance of d metres, in [0, 1]; 0: no target.
     A target at the very same place is in bracket 0.
 
     **Observation** `"as-coded"` `[rovers, 75]`. 0: index of the rover; 1 + b: rovers; 37 + b: POIs;
     73: speed of the last step; 74: heading in half turns, in `"as-coded"` motion without bound.
-    The value is 1/d² (POIs: value/d²; d = 0 counts as 0.001) and -1 for nobody; bracket b holds
+    The value is 1/d² (POIs: value/d²; d = 0 counts as 0.001) and -1 for none; bracket b holds
     directions [10b°, 10b+10°) *clockwise from +y of the world*, whatever the heading.
 
     **Signals**, those named in `rewards`:
@@ -120,6 +120,8 @@ class Rover(AbstractEnvironment):
 
     `terminated` once all POIs are observed, `truncated` at `max_steps`.
     """
+
+    action_size: ClassVar[int] = 2
 
     rovers: int | None = eqx.field(static=True, default=None)
     """Agents, at least `coupling`; None: 2·coupling."""
@@ -164,10 +166,7 @@ class Rover(AbstractEnvironment):
     def __check_init__(self):
         for name in ("pois", "coupling", "max_steps", "harvest_period"):
             require.at_least(name, getattr(self, name), 1)
-        require.choice("local", self.local, ("distance", "unobserved", "closeness", "progress"))
-        require.choice("observation", self.observation, ("relative", "as-coded"))
-        require.choice("motion", self.motion, ("as-written", "as-coded"))
-        require.choice("start", self.start, ("continuous", "as-coded"))
+        require.literals(self)
         for name in ("size", "activation_distance", "max_speed"):
             require.at_least(name, getattr(self, name), 1e-6)
         if self.agents < self.coupling:
@@ -203,10 +202,6 @@ class Rover(AbstractEnvironment):
     @property
     def obs_size(self) -> int:
         return 2 * BRACKETS if self.observation == "relative" else 2 * BRACKETS + 3
-
-    @property
-    def action_size(self) -> int:
-        return 2
 
     @property
     def obs_range(self) -> tuple[float, float]:
@@ -371,6 +366,7 @@ class Rover(AbstractEnvironment):
         return position, drawn[jnp.arange(self.pois), chosen]
 
     def _move(self, state: RoverState, action: Float[Array, "rovers 2"]):
+        """Positions (m), headings (rad) and speeds (m per step) after clipped actions."""
         if self.motion == "as-coded":
             heading = state.heading + 0.5 * math.pi * action[:, 1]
             speed = jnp.full(self.agents, CODED_SPEED)
@@ -444,6 +440,8 @@ class Rover(AbstractEnvironment):
     def _pay(
         self, state: RoverState, local: Float[Array, " rovers"], ended: Bool[Array, ""]
     ) -> dict[str, Array]:
+        """The named rewards of a step: `local` in every step, the others once the episode has
+        `ended`."""
         share = self._share(state.observed, state.nearness)
         rewards = {"local": local, "global": jnp.where(ended, share, 0.0)}
         if "mixed" in self.rewards:
@@ -458,6 +456,7 @@ class Rover(AbstractEnvironment):
         return {name: rewards[name] for name in self.rewards}
 
     def _share(self, observed: Bool[Array, "*rovers pois"], nearness) -> Float[Array, "*rovers"]:
+        """Share of the POIs' value that is observed, or of what `nearness` pays for the others."""
         paid = observed.astype(jnp.float32)
         if nearness is not None:
             paid = jnp.maximum(paid, nearness)
@@ -485,7 +484,7 @@ class Rover(AbstractEnvironment):
         """What the sensors say; `apart` and `distance` of rovers and POIs are known already."""
         apart_rovers, distance_rovers = _apart(state.position, state.position)
         coded = self.observation == "as-coded"
-        nobody = -1.0 if coded else 0.0
+        nothing = -1.0 if coded else 0.0
         itself = jnp.eye(self.agents, dtype=bool)
         gone = jnp.broadcast_to(state.observed[None], distance.shape)
         worth = 1.0
@@ -501,8 +500,8 @@ class Rover(AbstractEnvironment):
             else:
                 cos, sin = jnp.cos(state.heading)[:, None], jnp.sin(state.heading)[:, None]
                 strength, ahead, left = 1.0 / (1.0 + d), cos * x + sin * y, cos * y - sin * x
-            strength = jnp.where(hidden, nobody, strength)
-            rings.append(_ring(_bracket(ahead, left), strength, nobody))
+            strength = jnp.where(hidden, nothing, strength)
+            rings.append(_ring(_bracket(ahead, left), strength, nothing))
         if coded:
             index = jnp.arange(self.agents, dtype=jnp.float32)[:, None]
             rings = [index, *rings, state.speed[:, None], state.heading[:, None] / math.pi]
@@ -541,7 +540,7 @@ def _atan(t: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def _ring(
-    bracket: Int[Array, "rovers targets"], strength: Float[Array, "rovers targets"], nobody: float
+    bracket: Int[Array, "rovers targets"], strength: Float[Array, "rovers targets"], nothing: float
 ) -> Float[Array, "rovers 36"]:
     """The strongest target in each bracket.
 
@@ -549,7 +548,7 @@ def _ring(
     """
     rovers = bracket.shape[0]
     return (
-        jnp.full((rovers, BRACKETS), nobody).at[jnp.arange(rovers)[:, None], bracket].max(strength)
+        jnp.full((rovers, BRACKETS), nothing).at[jnp.arange(rovers)[:, None], bracket].max(strength)
     )
 
 
@@ -584,6 +583,7 @@ def _coded_places(rovers: int, pois: int, size, rover_key: PRNGKeyArray, poi_key
 
 
 def _check_rewards(env: Rover) -> None:
+    """Raise `ValueError` unless each reward is known, named once, and defined for these options."""
     if not env.rewards or len(set(env.rewards)) < len(env.rewards):
         raise ValueError(f"rewards is {env.rewards}: name at least one, and each only once")
     for name in env.rewards:
@@ -596,6 +596,7 @@ def _check_rewards(env: Rover) -> None:
 
 
 def _check_pois(env: Rover) -> None:
+    """Raise `ValueError` unless values and places are as many as POIs and rovers."""
     if env.poi_values is not None:
         if len(env.poi_values) != env.pois:
             raise ValueError(

@@ -20,7 +20,7 @@ from typing import ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .. import require
 from ..types import Sequence
@@ -34,6 +34,7 @@ class SequenceClassification(AbstractSequenceTask):
     product reaches 1, with S the running sum (plus ½ where a tie is class +1).
     """
 
+    obs_size: ClassVar[int] = 1
     obs_range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
     inputs: ClassVar[tuple[str, ...]] = ("signal",)
 
@@ -56,11 +57,7 @@ class SequenceClassification(AbstractSequenceTask):
                 f"gaps of {self.min_gap}..{self.max_gap} zeros: needs 0 <= min_gap <= max_gap"
             )
         require.within("persistence", self.persistence, 0, 1)
-        require.choice("ties", self.ties, ("positive", "free"))
-
-    @property
-    def obs_size(self) -> int:
-        return 1
+        require.literals(self)
 
     @property
     def max_steps(self) -> int:
@@ -90,12 +87,6 @@ class SequenceClassification(AbstractSequenceTask):
         targets = running + 0.5 if self.ties == "positive" else running
         return Sequence(inputs[:, None], targets, scored, position[-1] + 1)
 
-    def reward(
-        self,
-        answer: Float[Array, "*b"],
-        target: Float[Array, "*b"],
-        scored: Bool[Array, "*b"],
-        perfect: Bool[Array, "*b"],
-    ) -> Float[Array, "*b"]:
+    def reward(self, answer, target, scored, perfect):
         product = jnp.clip(answer * target, -1.0, 1.0)
         return product + (scored & (product >= 1.0)).astype(jnp.float32)

@@ -18,7 +18,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .. import require
 from ..types import Sequence
@@ -29,9 +29,10 @@ class SequenceRecall(AbstractSequenceTask):
     """Directions first, then corridors; the turns count.
 
     The reward is the author's: at a junction [½·t·y + ½·(every turn so far was right)] / depth,
-    with t the direction ±1 and y the answer in [-1, 1]. So an episode earns -½..1.
+    with t the direction ±1 and y the answer in [-1, 1]. So returns lie in -½..1.
     """
 
+    obs_size: ClassVar[int] = 2
     inputs: ClassVar[tuple[str, ...]] = ("direction", "distance to the junction")
 
     depth: int = eqx.field(static=True, default=6)  # directions and junctions, at least 1
@@ -55,10 +56,6 @@ class SequenceRecall(AbstractSequenceTask):
     @property
     def obs_range(self) -> tuple[float, float]:
         return -1.0, self.max_corridor / (self.unit or self.max_corridor)
-
-    @property
-    def obs_size(self) -> int:
-        return 2
 
     @property
     def max_steps(self) -> int:
@@ -94,12 +91,6 @@ class SequenceRecall(AbstractSequenceTask):
         played = jnp.arange(self.max_steps) < sequence.length
         return sequence.targets, played.astype(jnp.float32)
 
-    def reward(
-        self,
-        answer: Float[Array, "*b"],
-        target: Float[Array, "*b"],
-        scored: Bool[Array, "*b"],
-        perfect: Bool[Array, "*b"],
-    ) -> Float[Array, "*b"]:
+    def reward(self, answer, target, scored, perfect):
         earned = 0.5 * target * answer + 0.5 * perfect.astype(jnp.float32)
         return jnp.where(scored, earned, 0.0) / self.depth

@@ -40,6 +40,8 @@ ACTS, BUSY, AWAY = 1.0, 0.0, -1.0  # a server's status, as observed
 
 
 class FleetState(eqx.Module):
+    """A fleet between two steps."""
+
     genuine: Bool[Array, " devices"]
     pending: Int[Array, " devices"]  # requests not served yet, at least 0
     told: Float[Array, "servers devices"]  # ±1 where a server was last told what it had served
@@ -95,7 +97,7 @@ class ServerFleet(AbstractEnvironment):
     than 0. Raw counts drown the worth: 20 devices with 5 requests each against one ±1."""
     schedule: tuple[tuple[int, int], ...] | None = eqx.field(static=True, default=None)
     """One (joins, leaves) per server: it is away before step `joins` and from step `leaves` on,
-    counted from 0. None: nobody is ever away."""
+    counted from 0. None: no server is ever away."""
     classes: tuple[bool, ...] | None = eqx.field(static=True, default=None)
     """Whether each device is genuine, the same in every episode; None: drawn by `nefarious`."""
 
@@ -107,8 +109,7 @@ class ServerFleet(AbstractEnvironment):
     def __check_init__(self):
         for name in ("servers", "devices", "requests", "max_steps"):
             require.at_least(name, getattr(self, name), 1)
-        require.choice("observation", self.observation, ("signed one-hot", "scalar"))
-        require.choice("told", self.told, ("once", "until-action"))
+        require.literals(self)
         low, high = span(self.nefarious)
         if not 0 <= low <= high <= self.devices:
             raise ValueError(
@@ -134,6 +135,7 @@ class ServerFleet(AbstractEnvironment):
         self._check_schedule()
 
     def _check_schedule(self):
+        """Raise `ValueError` unless every server has times to join and leave, in this order."""
         if self.schedule is None:
             return
         if not isinstance(self.schedule, Sequence):
@@ -244,12 +246,14 @@ class ServerFleet(AbstractEnvironment):
         return (joins <= step) & (step < leaves)
 
     def _busy_steps(self, *, key: PRNGKeyArray) -> Int[Array, " servers"]:
+        """For how many steps each server would be busy after acting now."""
         low, high = span(self.busy)
         if low == high:
             return jnp.full(self.servers, low, jnp.int32)
         return jax.random.randint(key, (self.servers,), low, high + 1)
 
     def _time_step(self, state: FleetState, net: Float[Array, ""]) -> TimeStep:
+        """What servers observe of a state, and `net` for the step that led to it."""
         present = self.present(state.step)
         active = present & (state.busy == 0)
         counts, worth = self.scale

@@ -49,6 +49,7 @@ class SimpleSpread(AbstractEnvironment):
     """
 
     signals: ClassVar[tuple[str, ...]] = ("global", "local")
+    reported: ClassVar[str] = "global"
     action_size: ClassVar[int] = 2
 
     agents: int = eqx.field(static=True, default=3)  # agents and landmarks, at least 2 of each
@@ -60,10 +61,6 @@ class SimpleSpread(AbstractEnvironment):
         require.at_least("agents", self.agents, 2)
         require.at_least("max_steps", self.max_steps, 1)
         require.within("local_ratio", self.local_ratio, 0.0, 1.0)
-
-    @property
-    def reported(self) -> str:
-        return "global"
 
     @property
     def obs_size(self) -> int:
@@ -99,6 +96,7 @@ class SimpleSpread(AbstractEnvironment):
         return way, jnp.sqrt(jnp.sum(way**2, axis=-1))
 
     def _earned(self, state: SpreadState) -> Float[Array, " agents"]:
+        """mpe2's reward of each agent: collisions and uncovered landmarks."""
         _, distance = self._apart(state.position)
         hits = jnp.sum((distance < REACH).astype(jnp.float32), axis=1) - 1.0  # not with itself
         way = state.landmarks[:, None] - state.position[None]
@@ -113,6 +111,7 @@ class SimpleSpread(AbstractEnvironment):
         return TimeStep(self._observe(state), rewards, jnp.bool_(False), truncated, everyone)
 
     def _observe(self, state: SpreadState) -> Float[Array, "agents obs"]:
+        """Velocity, position, and the ways to landmarks and other agents, one row an agent."""
         n, here = self.agents, state.position
         others = np.array([[k for k in range(n) if k != i] for i in range(n)])
         parts = [

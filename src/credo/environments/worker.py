@@ -115,7 +115,7 @@ class Environments:
     """
 
     def __init__(self, spec: dict[str, Any], n: int, current: Any = None):
-        self._alone = current is not None  # nobody's Ctrl-C is meant for this process
+        self._alone = current is not None  # Ctrl-C is not meant for this process
         self.current = [0, 0] if current is None else current
         self.n, self._spec, self._envs = n, spec, []
         self._kind = APIS[spec.get("api", "gymnasium")]
@@ -133,6 +133,7 @@ class Environments:
         self._steps = [-1] * n  # in this episode; -1: there is none
 
     def _open(self, i: int) -> Any:
+        """Make copy `i`, while `current` says so."""
         self.current[0], self.current[1] = i, 1
         try:
             return self._kind.make(self._spec)
@@ -178,6 +179,7 @@ class Environments:
         return frame
 
     def _given(self, actions: np.ndarray, active: np.ndarray) -> None:
+        """Raise `Fault` of the first active copy whose action is not finite."""
         if np.isfinite(actions).all():
             return
         for i in active.nonzero()[0].tolist():
@@ -204,6 +206,7 @@ class Environments:
             self._broke(frame, i, Fault(f"returned {what} in {where}", how))
 
     def _broke(self, frame: Frame, i: int, fault: Fault) -> None:
+        """The episode of copy `i` has failed: close it, so that the next one opens it anew."""
         frame.fail(i, fault)
         self._steps[i] = -1
         if i < len(self._envs) and self._envs[i] is not None:
@@ -230,7 +233,7 @@ class Environments:
 
     def close(self, grace: float = 0.0) -> None:
         while self._envs:
-            with contextlib.suppress(Exception):  # nobody needs it any more
+            with contextlib.suppress(Exception):  # it is not needed any more
                 self._envs.pop().close()
 
 
@@ -247,6 +250,7 @@ class Lost(Fault):
 
 
 def _message(kind: int, value: Any) -> bytes:
+    """Header and JSON."""
     text = json.dumps(value).encode()
     return HEADER.pack(kind, len(text)) + text
 
@@ -304,6 +308,7 @@ class Process:
         return self._call(STEP, actions, active)
 
     def _call(self, kind: int, numbers: np.ndarray, active: np.ndarray) -> Frame:
+        """One request, and the frame that answers it."""
         frame = self._blank.fresh()
         payload = numbers.tobytes() + active.tobytes()
         self._ask(HEADER.pack(kind, len(payload)) + payload, frame.buffer)
@@ -322,6 +327,7 @@ class Process:
         return self._reply(reply)
 
     def _reply(self, reply: bytearray) -> bytearray:
+        """The next message of the worker, of which a `Fault` is raised."""
         got = self._receive(reply, 0, HEADER.size)
         kind, length = HEADER.unpack_from(reply)
         if HEADER.size + length != len(reply):
@@ -346,7 +352,7 @@ class Process:
         view = memoryview(into)
         while got < least:
             if self._in not in self._wait(self._readable):
-                raise self._ended()  # though somebody it started may hold the pipe open
+                raise self._ended()  # though a process it started may hold the pipe open
             count = os.readv(self._in, [view[got:]])
             if count == 0:
                 raise self._ended()
@@ -371,6 +377,7 @@ class Process:
         return [descriptor for descriptor, _ in ready]
 
     def _ended(self) -> Lost:
+        """How the worker ended, as the error to be raised."""
         how = "and left it running"
         if self._process.over(GRACE):
             status = self._process.returncode
@@ -426,6 +433,7 @@ def _serve(requests: int, replies: int, current: memoryview) -> None:
 
 
 def _answer(environments: Environments, kind: int, payload: bytes) -> Frame:
+    """What the copies say to one request; its payload is an array `[n, ...]` and `active`."""
     n = environments.n
     active = np.frombuffer(payload, np.bool_, n, len(payload) - n)
     if kind == RESET:

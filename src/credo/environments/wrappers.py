@@ -2,6 +2,7 @@
 
 import dataclasses
 import threading
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,23 +17,36 @@ from .host import AbstractCopies, AbstractHostEnvironment, HostStep
 from .viewer import Viewer
 
 
-class Shortened(AbstractSequenceTask):
+def _of(part: str, name: str) -> Any:
+    """A property that is the one of a part, the wrapped task."""
+    return property(lambda self: getattr(getattr(self, part), name))
+
+
+class AbstractCut(AbstractSequenceTask):
+    """A sequence task that asks for the answers of another one."""
+
+    task: AbstractSequenceTask  # the task that says what an answer is worth
+
+    unwrapped = _of("task", "unwrapped")
+
+    def lesson(self, sequence):
+        return self.task.lesson(sequence)
+
+    def reward(self, answer, target, scored, perfect):
+        return self.task.reward(answer, target, scored, perfect)
+
+
+class Shortened(AbstractCut):
     """A sequence task that ends after its first `questions` scored steps.
 
     `questions` is data: a curriculum that changes it compiles nothing. `max_steps` stays that of
     the whole task, but what is cut off is not played.
     """
 
-    task: AbstractSequenceTask  # the task that is cut short
     questions: Int[Array, ""] | int  # scored steps that are left, at least 1
 
-    @property
-    def obs_size(self) -> int:
-        return self.task.obs_size
-
-    @property
-    def max_steps(self) -> int:
-        return self.task.max_steps
+    obs_size = _of("task", "obs_size")
+    max_steps = _of("task", "max_steps")
 
     def sample(self, *, key: PRNGKeyArray) -> Sequence:
         sequence = self.task.sample(key=key)
@@ -43,22 +57,11 @@ class Shortened(AbstractSequenceTask):
         scored = sequence.scored & (jnp.arange(self.max_steps) < length)
         return Sequence(sequence.inputs, sequence.targets, scored, length)
 
-    @property
-    def unwrapped(self) -> AbstractEnvironment:
-        return self.task.unwrapped
 
-    def lesson(self, sequence):
-        return self.task.lesson(sequence)
-
-    def reward(self, answer, target, scored, perfect):
-        return self.task.reward(answer, target, scored, perfect)
-
-
-class Given(AbstractSequenceTask):
+class Given(AbstractCut):
     """A sequence task of which the sequences are given: in `rollout.evaluate` every features-first
     policy answers each of them once. An episode alone draws one of them."""
 
-    task: AbstractSequenceTask  # that says what an answer earns
     sequences: Sequence  # leaves [n, ...], at least one
 
     @classmethod
@@ -78,19 +81,9 @@ class Given(AbstractSequenceTask):
     def max_steps(self) -> int:
         return self.sequences.inputs.shape[1]
 
-    @property
-    def unwrapped(self) -> AbstractEnvironment:
-        return self.task.unwrapped
-
     def sample(self, *, key: PRNGKeyArray) -> Sequence:
         i = jax.random.randint(key, (), 0, self.n)
         return jax.tree.map(lambda x: x[i], self.sequences)
-
-    def lesson(self, sequence):
-        return self.task.lesson(sequence)
-
-    def reward(self, answer, target, scored, perfect):
-        return self.task.reward(answer, target, scored, perfect)
 
 
 class AbstractWrapper(AbstractEnvironment):
@@ -98,33 +91,13 @@ class AbstractWrapper(AbstractEnvironment):
 
     env: AbstractEnvironment  # the wrapped task
 
-    @property
-    def obs_size(self) -> int:
-        return self.env.obs_size
-
-    @property
-    def action_size(self) -> int:
-        return self.env.action_size
-
-    @property
-    def max_steps(self) -> int:
-        return self.env.max_steps
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        return self.env.signals
-
-    @property
-    def agents(self) -> int | None:
-        return self.env.agents
-
-    @property
-    def reported(self) -> str:
-        return self.env.reported
-
-    @property
-    def unwrapped(self) -> AbstractEnvironment:
-        return self.env.unwrapped
+    obs_size = _of("env", "obs_size")
+    action_size = _of("env", "action_size")
+    max_steps = _of("env", "max_steps")
+    signals = _of("env", "signals")
+    agents = _of("env", "agents")
+    reported = _of("env", "reported")
+    unwrapped = _of("env", "unwrapped")
 
     def bare(self, state: PyTree) -> PyTree:
         return self.env.bare(state)
@@ -200,9 +173,7 @@ class DelayedReward(AbstractWrapper):
         if not isinstance(self.env, AbstractEnvironment):
             raise ValueError(f"{type(self.env).__name__} is no JAX task: use delayed(env)")
 
-    @property
-    def obs_range(self) -> tuple[float, float]:
-        return self.env.obs_range
+    obs_range = _of("env", "obs_range")
 
     def bare(self, state: DelayedState) -> PyTree:
         return self.env.bare(state.inner)
@@ -230,60 +201,20 @@ class DelayedHostReward(AbstractHostEnvironment):
         if not isinstance(self.env, AbstractHostEnvironment):
             raise ValueError(f"{type(self.env).__name__} is no host task: use delayed(env)")
 
-    @property
-    def obs_size(self) -> int:
-        return self.env.obs_size
-
-    @property
-    def action_size(self) -> int:
-        return self.env.action_size
-
-    @property
-    def max_steps(self) -> int:
-        return self.env.max_steps
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        return self.env.signals
-
-    @property
-    def agents(self) -> int | None:
-        return self.env.agents
-
-    @property
-    def discrete(self) -> bool:
-        return self.env.discrete
-
-    @property
-    def reported(self) -> str:
-        return self.env.reported
-
-    @property
-    def unwrapped(self) -> AbstractHostEnvironment:
-        return self.env.unwrapped
-
-    @property
-    def reward_shapes(self) -> dict[str, tuple[int, ...]]:
-        return self.env.reward_shapes
-
-    @property
-    def obs_dtype(self) -> str:
-        return self.env.obs_dtype
-
-    @property
-    def at_once(self) -> int | None:
-        return self.env.at_once
-
-    @property
-    def obs_range(self):
-        return self.env.obs_range
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        return self.env.warnings
-
-    def task_record(self):
-        return self.env.task_record()
+    obs_size = _of("env", "obs_size")
+    action_size = _of("env", "action_size")
+    max_steps = _of("env", "max_steps")
+    signals = _of("env", "signals")
+    agents = _of("env", "agents")
+    reported = _of("env", "reported")
+    unwrapped = _of("env", "unwrapped")
+    discrete = _of("env", "discrete")
+    reward_shapes = _of("env", "reward_shapes")
+    obs_dtype = _of("env", "obs_dtype")
+    obs_range = _of("env", "obs_range")
+    at_once = _of("env", "at_once")
+    warnings = _of("env", "warnings")
+    task_record = _of("env", "task_record")
 
     def copies(self, n: int) -> "DelayedCopies":
         inner = self.env.copies(n)
@@ -294,16 +225,14 @@ class DelayedHostReward(AbstractHostEnvironment):
 
 
 class DelayedCopies(AbstractCopies):
+    """Copies whose rewards are paid at the last step of each episode."""
+
+    failed = _of("inner", "failed")
+    failure_text = _of("inner", "failure_text")
+
     def __init__(self, inner: AbstractCopies, shapes: dict[str, tuple[int, ...]]):
         self.inner, self.n = inner, inner.n
         self._earned = {name: np.zeros((inner.n, *shape)) for name, shape in shapes.items()}
-
-    @property
-    def failed(self) -> np.ndarray | None:
-        return self.inner.failed
-
-    def failure_text(self, i: int) -> str:
-        return self.inner.failure_text(i)
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
         for earned in self._earned.values():

@@ -1,19 +1,12 @@
 """An experiment is data: cells of runs, what is measured of them, and how rows are shown.
 
-A module of this folder defines one figure or table as `EXPERIMENT`; `catalogue` has its id and its
-title. A cell has labels, an algorithm, a budget and seeds; its name and folder are made of its
-labels, and nothing is ever read back from a name. What is measured are rows
+Figures and tables that share their cells are one module of this folder; its `EXPERIMENTS` are by
+the ids that `catalogue` has. What the dissertation says of each, and what to know before comparing,
+is in `dissertation.toml`. A cell has labels, an algorithm, a budget and seeds; its name and folder
+are made of its labels, and nothing is ever read back from a name. What is measured are rows
 (`credo.report.rows`), a figure is a view of rows (`views`). A whole module:
 
     '''Figure 9.1: TD3 and ERL on a pendulum, at two sizes of their networks.'''
-
-    from ..algorithms.erl import ERL
-    from ..algorithms.off_policy import OffPolicy
-    from ..environments.gymnasium import Gymnasium
-    from ..networks.mlp import MLP
-    from . import measures
-    from .base import Cell, Experiment, Value, grid
-    from .views import Curves, Table, known, mean, published
 
     METHODS = {"td3": OffPolicy.td3, "erl": ERL.erl}
     FRAMES = {"smoke": 2_000, "quick": 20_000, "full": 200_000}
@@ -27,17 +20,17 @@ labels, and nothing is ever read back from a name. What is measured are rows
         ]
 
 
-    EXPERIMENT = Experiment(
-        published="Figure 9.1: ERL is better at either size.",
-        cells=cells,
-        measures=(measures.final(), measures.scores(), measures.of_task(measures.random_actions)),
-        views=(
-            Curves("test score", "frames", line=["method"], panel=["width"]),
-            Table("Return", ["width", "method"], {"random": known("random"),
-                  "published": published("return"), "final champion": mean("return")}),
+    EXPERIMENTS = {
+        "fig-9.1": Experiment(
+            cells,
+            (measures.final(), measures.scores(), measures.of_task(measures.random_actions)),
+            (
+                Curves("test score", "frames", line=["method"], panel=["width"]),
+                Table("Return", ["width", "method"], {"random": known("random"),
+                      "published": published("return"), "final champion": mean("return")}),
+            ),
         ),
-        values=(Value(-150.0, "return", "its text", {"method": "erl", "width": 64}),),
-    )
+    }
 """
 
 import importlib
@@ -47,24 +40,29 @@ import pathlib
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import tomllib
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
+from importlib import resources
 from typing import Any
 
+import numpy as np
 from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from .. import tree
 from ..executors import local
 from ..report import pages
-from ..report.rows import Label, Labels, Results, Row, Series, concat, read, write
-from ..report.sections import SMOKE, Page, Section
+from ..report.rows import Label, Labels, Results, Row, Series, concat, read, rows, series, write
+from ..report.sections import SMOKE, Page, Section, Text
 from ..runs import config, log
 from ..runs.options import RunOptions
 from ..runs.record import RunError
 from ..runs.store import Run
 from . import catalogue
 
+Axis = tuple[str, ArrayLike]  # "frames", and where on it
 BUDGETS = ("smoke", "quick", "full")  # seconds, minutes, hours
 
 
@@ -136,11 +134,44 @@ class Trained:
         """The final champions as one population `[runs, …]`."""
         return tree.stack(*(run.champion for run in self.runs))
 
+    @property
+    def scores(self) -> np.ndarray:
+        """The champions' tests `[runs, generations]`, of runs that are equally long."""
+        return np.stack([run.metrics["champion_score"] for run in self.runs])
+
+    def part(self, seed: int | None = None, /, **labels: Label) -> "Trained":
+        """The same with more labels; with a `seed`, of that run alone."""
+        chosen = [i for i, x in enumerate(self.seeds) if seed in (x, None)]
+        seeds, runs = [self.seeds[i] for i in chosen], [self.runs[i] for i in chosen]
+        cell = replace(self.cell, labels={**self.labels, **labels}, seeds=seeds)
+        return replace(self, cell=cell, runs=runs)
+
+    def rows(self, metric: str, values: Any, digits: int | None = None, **axes: Any) -> list[Row]:
+        """Values `[runs, …]`, rounded to `digits`, as rows; `axes` name the other dimensions, as in
+        `credo.report.rows.rows`."""
+        return rows(metric, rounded(values, digits), self.labels, seed=self.seeds, **axes)
+
+    def series(
+        self, metric: str, at: Axis, values: Any, digits: int | None = None, **axes: Any
+    ) -> list[Series]:
+        """Values `[runs, …, points]` as series over `at`, the name and places of their axis."""
+        found = rounded(values, digits)
+        return series(metric, *at, found, self.labels, seed=self.seeds, **axes)
+
+    def fact(self, metric: str, value: Any, **labels: Label) -> Row:
+        """A row of the cell as a whole: a baseline, a bound."""
+        return Row({**self.labels, **labels}, None, metric, value)
+
     def record(self) -> dict[str, Any]:
         """The cell as `results.json` has it, with the core-hours that its runs took."""
         clocks = [log.read(run.path / log.TIMING) for run in self.runs]
         hours = sum(float(clock["seconds"][-1]) for clock in clocks if clock) / 3600
         return self.cell.record() | {"machine": config.machine(), "hours": round(hours, 2)}
+
+
+def rounded(values: Any, digits: int | None) -> Any:
+    """Short enough for a text file; as given without `digits`."""
+    return values if digits is None else np.round(np.asarray(values, np.float64), digits)
 
 
 Measure = Callable[[Trained], Iterable[Row | Series]]
@@ -158,24 +189,26 @@ class Value:
     spread: str = ""
 
 
-View = Section | Callable[[Results, Sequence[Value]], Iterable[Section]]
+View = Callable[[Results, Sequence[Value]], Iterable[Section]]
 
 
 @dataclass(frozen=True)
 class Experiment:
     """A figure or table, as data.
 
-    `published`: what the dissertation has, and where. `cells(budget)`: the runs it needs.
-    `measures`: rows of each cell. `views`: sections of the page, in order; a view without rows is
-    left out. `values`: published numbers.
+    `cells(budget)`: the runs it needs. `measures`: rows of each cell. `views`: sections of the
+    page, in order; a view without rows is left out. `published`: what the dissertation has, and
+    where. `values`: published numbers. `notes`: paragraphs to read before comparing; one with
+    labels stands only on pages with such cells. `find` adds these three.
     """
 
-    published: str
     cells: Callable[[str], list[Cell]]
     measures: Sequence[Measure]
     views: Sequence[View]
+    budgets: Collection[str] = BUDGETS
+    published: str = ""
     values: Sequence[Value] = ()
-    budgets: Sequence[str] = BUDGETS
+    notes: Sequence[tuple[str, Labels]] = ()
 
 
 def named(labels: Labels) -> str:
@@ -196,8 +229,27 @@ def grid(**axes: Iterable[Label]) -> list[dict[str, Label]]:
 
 
 def find(name: str) -> Experiment:
-    """The experiment of an id of the catalogue."""
-    return importlib.import_module(f".{catalogue.module(name)}", __package__).EXPERIMENT
+    """The experiment of an id of the catalogue, with its texts and published numbers."""
+    module = importlib.import_module(f".{catalogue.module(name)}", __package__)
+    told = [_texts()[part] for part in _texts()[name].get("parts", [name])]
+    values = [
+        Value(**{k: part[k] for k in ("metric", "source") if k in part} | value)
+        for part in told
+        for value in part.get("values", ())
+    ]
+    notes = [
+        (x, part.get("labels", {})) if isinstance(x, str) else (x["text"], x["labels"])
+        for part in told
+        for x in part.get("notes", ())
+    ]
+    published = _texts()[name]["published"]
+    return replace(module.EXPERIMENTS[name], published=published, values=values, notes=notes)
+
+
+@cache
+def _texts() -> dict[str, Any]:
+    path = resources.files("credo.experiments").joinpath("dissertation.toml")
+    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 # ------------------------------------------------------------------------------------ reproduce
@@ -247,17 +299,17 @@ def trained(
     cells: list[Cell], budget: str, work: pathlib.Path, jobs: int | None, title: str
 ) -> list[Trained]:
     """The cells with their runs, in folders of `work`; what is missing of them is trained."""
-    paths = [[work / cell.folder / str(seed) for seed in cell.seeds] for cell in cells]
+
+    def path(cell: Cell, seed: int) -> pathlib.Path:
+        return work / cell.folder / str(seed)
+
     wanted = [
-        local.Job(path, cell.algorithm, seed, RunOptions(**cell.budget, tensorboard=False))
-        for cell, folders in zip(cells, paths, strict=True)
-        for seed, path in zip(cell.seeds, folders, strict=True)
+        local.Job(path(c, seed), c.algorithm, seed, RunOptions(**c.budget, tensorboard=False))
+        for c in cells
+        for seed in c.seeds
     ]
     local.run(wanted, jobs, title=title)
-    return [
-        Trained(cell, [Run(path) for path in folders], budget)
-        for cell, folders in zip(cells, paths, strict=True)
-    ]
+    return [Trained(c, [Run(path(c, seed)) for seed in c.seeds], budget) for c in cells]
 
 
 def matching(cells: list[Cell], only: str, where: str) -> list[Cell]:
@@ -287,16 +339,16 @@ def kept(path: pathlib.Path, every: list[Cell], chosen: list[Cell]) -> Results |
             "it; otherwise move it away, or choose another --output"
         ) from error
     now, known = {cell.name for cell in chosen}, {cell.name: cell for cell in every}
-    others = {named(x["labels"]): x for x in earlier.cells if named(x["labels"]) not in now}
-    why = {name: _other_runs(record, known.get(name)) for name, record in others.items()}
+    others = {name: part for name, part in by_cell(earlier).items() if name not in now}
+    why = {name: _other_runs(part.cells[0], known.get(name)) for name, part in others.items()}
     for name, lines in why.items():
         if lines:
             print(f"not kept of {path}: {name} ({'; '.join(lines)})", file=sys.stderr)
-    stay = {name: record for name, record in others.items() if not why[name]}
+    stay = {name: part for name, part in others.items() if not why[name]}
     if not stay:
         return None
     print(f"kept of {path}: {'; '.join(stay)}", file=sys.stderr)
-    return _of_cells(earlier, list(stay.values()))
+    return joined(earlier, stay.values())
 
 
 def _other_runs(record: Mapping[str, Any], cell: Cell | None) -> list[str]:
@@ -313,40 +365,42 @@ def _other_runs(record: Mapping[str, Any], cell: Cell | None) -> list[str]:
     return config.differences(record["budget"], today["budget"]) + lines
 
 
-def _of_cells(results: Results, cells: Sequence[Mapping[str, Any]]) -> Results:
-    """Only rows and curves of these cells: those whose labels, as far as cells have them, agree."""
+def by_cell(results: Results) -> dict[str, Results]:
+    """Results of each cell, by its name: rows and curves whose labels, as far as cells have them,
+    are those of the cell."""
     names = {name for cell in results.cells for name in cell["labels"]}
 
-    def key(labels: Labels) -> frozenset[tuple[str, Any]]:
+    def own(labels: Labels) -> frozenset[tuple[str, Any]]:
         return frozenset((name, value) for name, value in labels.items() if name in names)
 
-    wanted = {key(cell["labels"]) for cell in cells}
+    return {
+        named(cell["labels"]): replace(
+            results,
+            cells=[cell],
+            rows=[row for row in results.rows if own(row.labels) == own(cell["labels"])],
+            curves=[curve for curve in results.curves if own(curve.labels) == own(cell["labels"])],
+        )
+        for cell in results.cells
+    }
+
+
+def joined(results: Results, parts: Iterable[Results]) -> Results:
+    """The same with cells, rows and curves of these parts, in their order."""
+    parts = list(parts)
     return replace(
         results,
-        cells=list(cells),
-        rows=[row for row in results.rows if key(row.labels) in wanted],
-        curves=[curve for curve in results.curves if key(curve.labels) in wanted],
+        cells=[cell for part in parts for cell in part.cells],
+        rows=[row for part in parts for row in part.rows],
+        curves=[curve for part in parts for curve in part.curves],
     )
 
 
 def merged(earlier: Results, results: Results, every: list[Cell]) -> Results:
     """Results of two commands, in the order of the experiment's cells."""
-    both = replace(
-        results,
-        cells=[*earlier.cells, *results.cells],
-        rows=[*earlier.rows, *results.rows],
-        curves=[*earlier.curves, *results.curves],
-    )
-    there = {named(cell["labels"]): cell for cell in both.cells}
-    parts = [_of_cells(both, [there[cell.name]]) for cell in every if cell.name in there]
+    parts = by_cell(earlier) | by_cell(results)
     before = [part for part in earlier.command.split(" && ") if part != results.command]
-    return replace(
-        both,
-        command=" && ".join([*before, results.command]),
-        cells=[cell for part in parts for cell in part.cells],
-        rows=[row for part in parts for row in part.rows],
-        curves=[curve for part in parts for curve in part.curves],
-    )
+    told = replace(results, command=" && ".join([*before, results.command]))
+    return joined(told, [parts[cell.name] for cell in every if cell.name in parts])
 
 
 # ------------------------------------------------------------------------------------- its page
@@ -365,6 +419,8 @@ def describe(results: Results) -> Page:
     """The page of results."""
     experiment = find(results.experiment)
     machines = [cell["machine"] for cell in results.cells]
+    hosts = dict.fromkeys(map("{processor}, {device}, {system}".format_map, machines))
+    used = dict.fromkeys(", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines)
     return Page(
         title=f"{results.experiment}: {catalogue.EXPERIMENTS[results.experiment]}",
         lead=experiment.published,
@@ -373,21 +429,18 @@ def describe(results: Results) -> Page:
         facts={
             "budget": results.budget,
             "runs": [f"{named(c['labels'])}: {extent(c)}" for c in results.cells],
-            "machine": _once(f"{m['processor']}, {m['device']}, {m['system']}" for m in machines),
-            "versions": _once(
-                ", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines
-            ),
+            "machine": list(hosts),
+            "versions": list(used),
         },
         banner=SMOKE if results.budget == "smoke" else "",
     )
 
 
 def sections(experiment: Experiment, results: Results) -> list[Section]:
-    """What the views of an experiment make of results, in order."""
-    found: list[Section] = []
-    for view in experiment.views:
-        found += view(results, experiment.values) if callable(view) else [view]
-    return found
+    """What the views of an experiment make of results, in order, and how to read it."""
+    found = [x for view in experiment.views for x in view(results, experiment.values)]
+    told = [text for text, x in experiment.notes if not x or results.where(**x).cells]
+    return [*found, Text("How to read it", told)] if told else found
 
 
 def extent(cell: Mapping[str, Any]) -> str:
@@ -396,7 +449,3 @@ def extent(cell: Mapping[str, Any]) -> str:
     words = [f"{budget[name]:,} {name}" for name in ("frames", "generations") if name in budget]
     words += [f"a score of {budget['stop_at']:,.0f}"] if "stop_at" in budget else []
     return f"{len(cell['seeds'])} × {' or '.join(words)}"
-
-
-def _once(texts: Iterable[str]) -> list[str]:
-    return list(dict.fromkeys(texts))

@@ -5,22 +5,17 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-import jax
 import numpy as np
-from jaxtyping import Array
 
 from ..analysis import fleet, statistics
-from ..environments.extended_tmaze import ExtendedTMaze
 from ..environments.server_fleet import ServerFleet
 from ..environments.wrappers import NoisyObservations
 from ..report import sections as page
-from ..report.rows import Results, Row, Series, rows
-from ..rollout import evaluate
-from . import fig_4_2, fig_4_7
+from ..report.rows import Results, Row
+from . import fleets, tmazes
 from .base import Cell, Experiment, Trained, Value
-from .dissertation import notes, told
-from .fig_3_4a import rounded
-from .views import Of, Runs, Table
+from .measures import returns, where
+from .views import SEED, Of, Table
 
 NOISE = 0.5  # in training; a request that was served is told as 1 or -1
 TESTED = (0.0, 0.25, 0.5, 1.0)
@@ -38,9 +33,9 @@ QUESTIONS: dict[str, dict[str, Any]] = {  # T-mazes by table
 
 def cells(budget: str) -> list[Cell]:
     """Cells of Figures 4.2, 4.4 and 4.7, and beside each what is asked."""
-    tiny, maze = budget == "smoke", fig_4_2.cell
+    tiny, maze = budget == "smoke", tmazes.cell
     kinds = ("mmu", "lstm") if tiny else ("mmu", "lstm", "gru")
-    clear = fig_4_7.cells(budget)[0]  # DMMU, synchronous
+    clear = fleets.cells(budget)[0]  # DMMU, synchronous
     noisy = replace(clear.algorithm, env=_noisy(clear.algorithm.env, NOISE))
     return [
         *(
@@ -60,41 +55,33 @@ def _noisy(env: ServerFleet, std: float) -> NoisyObservations:
     return NoisyObservations(env, std, spared=1)  # the status
 
 
-def measure(trained: Trained) -> Iterator[Row | Series]:
-    """As Figures 4.2 and 4.7; of fleets also the final champions in every noise, and without noise
-    what becomes of them when servers leave and join."""
-    maze = isinstance(trained.env, ExtendedTMaze)
-    for shared in fig_4_2.MEASURES if maze else fig_4_7.MEASURES:
-        yield from shared(trained)
-    if maze:
-        return
-    env = fig_4_7.clear(trained.env)
+def in_noise(trained: Trained) -> Iterator[Row]:
+    """Net requests of the final champions of a fleet in every noise."""
+    env = fleets.clear(trained.env)
     for std in TESTED:
-        net, labels = played(_noisy(env, std), trained.champions), {**trained.labels, STD: std}
-        yield from pairs("net requests in noise", net, labels, trained.seeds)
-    if "noise" not in trained.labels:
-        yield from changed(trained, env)
+        net = played(_noisy(env, std), trained.champions)
+        yield from pairs(trained.part(**{STD: std}), "net requests in noise", net)
 
 
-def changed(trained: Trained, env: ServerFleet) -> Iterator[Row]:
+def changed(trained: Trained) -> Iterator[Row]:
     """Net requests by what happens to the fleet, beside baselines and bounds of the same task; and
     the difference that it makes, world by world: classes of devices are the same."""
     before = None
-    for name, (task, teams) in fleet.changes(env, trained.champions).items():
-        net, labels = played(task, teams), {**trained.labels, "fleet": name}
+    for name, (task, teams) in fleet.changes(fleets.clear(trained.env), trained.champions).items():
+        net, here = played(task, teams), trained.part(fleet=name)
         before = net if before is None else before
-        yield from pairs("net requests of a fleet", net, labels, trained.seeds)
-        yield from pairs("change", net - before, labels, trained.seeds)
-        known = fleet.floors_and_ceilings(task, 1000, key=jax.random.key(21_000))
-        for policy, found in known.items():
-            for metric, x in zip(both(REFERENCE), rounded(found, 3), strict=True):
-                yield from rows(metric, x, {**labels, "policy": policy})
+        yield from pairs(here, "net requests of a fleet", net)
+        yield from pairs(here, "change", net - before)
+        for policy, x in (fleet.played(task) | fleet.played(task, oracle=True)).items():
+            found = statistics.mean_and_standard_error(x)
+            for metric, value in zip(both(REFERENCE), found, strict=True):
+                yield here.fact(metric, round(float(value), 3), policy=policy)
 
 
-def played(env: ServerFleet | NoisyObservations, champions: Any) -> Array:
+def played(env: ServerFleet | NoisyObservations, champions: Any) -> np.ndarray:
     """Net requests served in fresh episodes: `[runs, episodes]`. Classes of devices and episodes
     do not depend on how many servers there are."""
-    return evaluate(env, champions, fig_4_7.EPISODES, key=jax.random.key(20_002)).of("net")
+    return returns(env, champions, fleets.EPISODES, 20_002, "net")
 
 
 def both(metric: str) -> tuple[str, str]:
@@ -102,11 +89,11 @@ def both(metric: str) -> tuple[str, str]:
     return metric, f"{metric}, s.e."
 
 
-def pairs(metric: str, net: Array, labels: Any, seeds: list[int]) -> Iterator[Row]:
+def pairs(trained: Trained, metric: str, net: np.ndarray) -> Iterator[Row]:
     """Mean and standard error over the episodes of each run."""
     found = statistics.mean_and_standard_error(net.T)
     for name, values in zip(both(metric), found, strict=True):
-        yield from rows(name, rounded(values, 3), labels, seed=seeds)
+        yield from trained.rows(name, values, 3)
 
 
 def pair(metric: str, sign: str = "", **labels: Any) -> Of:
@@ -145,55 +132,49 @@ def costs(results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
         yield page.Table(title, columns, body, caption="World by world; of scripts, of two means.")
 
 
-def of_question(title: str, where: dict[str, Any]) -> list[Any]:
+def of_question(title: str, labels: dict[str, Any]) -> list[Any]:
     """Table, curves and pictures of the T-mazes of a question."""
     heading = f"{title}: trials in which the final champion team observes the reward, %"
     return [
-        replace(fig_4_2.SCORES, title=heading, where=where),
-        replace(fig_4_2.CURVES, where=where),
-        lambda results, values: fig_4_2.pictures(results.where(**where), values),
+        replace(tmazes.SCORES, title=heading, where=labels),
+        replace(tmazes.CURVES, where=labels),
+        lambda results, values: tmazes.pictures(results.where(**labels), values),
     ]
 
 
-def if_any(task: str, view: Any) -> Any:
-    """A view that is shown if there is anything of its task."""
-    return lambda results, values: view(results, values) if results.where(task=task).rows else []
-
-
 FLEETS = {"task": "server fleet"}
-IN_NOISE = Runs(
+IN_NOISE = Table(
     "Noisy observations: net requests of final champions, by the noise of the test; {panel}",
+    [SEED],
     {f"tested at std {x:g}": pair("net requests in noise", "", **{STD: x}) for x in TESTED},
+    FLEETS,
     panel=("task", "timing", "network", "noise"),
-    where=FLEETS,
     caption="Mean ± standard error over 500 fresh episodes, the same for all.",
 )
 SIZES = Table(
     "Servers that leave and join: net requests of final champions",
-    rows=("fleet",),
-    columns={
+    ("fleet",),
+    {
         "baseline: random": pair(REFERENCE, policy="random"),
         "each run": pair("net requests of a fleet"),
         "a script that discovers": pair(REFERENCE, policy="discovering"),
         "an oracle": pair(REFERENCE, policy="oracle"),
     },
     caption="Mean ± standard error over 500 fresh episodes (baseline, script and oracle 1,000). "
-    "Trained without noise and with nobody leaving or joining, then not changed. Clones are of "
+    "Trained without noise and with no server leaving or joining, then not changed. Clones are of "
     "the first servers.",
 )
-EXPERIMENT = Experiment(
-    **told("beyond-4"),
-    budgets=fig_4_2.BUDGETS,
-    cells=cells,
-    measures=(measure,),
-    views=(
-        *(view for question in QUESTIONS.items() for view in of_question(*question)),
-        IN_NOISE,
-        replace(fig_4_7.SCORES, where=FLEETS),
-        replace(fig_4_7.CURVES, where=FLEETS),
-        SIZES,
-        costs,
-        if_any("spread", notes("T-mazes", "beyond-4, T-mazes")),
-        if_any("server fleet", notes("fleets", "beyond-4, fleets")),
-    ),
+VIEWS = (
+    *(view for question in QUESTIONS.items() for view in of_question(*question)),
+    IN_NOISE,
+    replace(fleets.SCORES, where=FLEETS),
+    replace(fleets.CURVES, where=FLEETS),
+    SIZES,
+    costs,
 )
+MEASURES = (
+    *(where(measure, timing=None) for measure in tmazes.MEASURES),
+    *(where(measure, **FLEETS) for measure in (*fleets.MEASURES, in_noise)),
+    where(changed, **FLEETS, noise=None),
+)
+EXPERIMENTS = {"beyond-4": Experiment(cells, MEASURES, VIEWS, tmazes.BUDGETS)}

@@ -46,7 +46,27 @@ EXPERIMENTS = {
     "check-spread": "MADDPG and MATD3 on simple_spread",
 }
 
+MODULES = {  # of this folder, with the experiments that each has
+    "sequences": ("fig-3.4a", "fig-3.4b", "fig-3.9a", "fig-3.9b"),
+    "generalization": ("fig-3.5a", "fig-3.5b", "fig-3.10", "fig-3.13"),
+    "memories": ("table-3.1", "table-3.2", "fig-3.6", "fig-3.7", "alg-3.3"),
+    "gradient": ("fig-3.11", "fig-3.12", "beyond-3"),
+    "ablation": ("ablation-3.4a",),
+    "tmazes": ("fig-4.2", "fig-4.3", "fig-4.4"),
+    "fleets": ("fig-4.7",),
+    "case_study": ("fig-4.8", "table-4.1"),
+    "beyond_4": ("beyond-4",),
+    "mujoco": ("check-td3", "fig-5.3", "fig-5.4", "table-5.2", "beyond-5"),
+    "check_learners": ("check-learners",),
+    "pendulum": ("fig-5.2",),
+    "runtime": ("note-5.5",),
+    "portfolios": ("fig-6.2", "fig-6.3", "fig-6.4", "fig-6.5", "table-6.1", "beyond-6"),
+    "rovers": ("fig-7.1", "fig-7.4", "beyond-7"),
+    "paths": ("fig-7.5",),
+    "check_spread": ("check-spread",),
+}
+
 
 def module(name: str) -> str:
-    """The module of this folder that an id stands for: `fig-3.4a` is `fig_3_4a`."""
-    return name.replace("-", "_").replace(".", "_")
+    """The module that has an experiment."""
+    return next(module for module, names in MODULES.items() if name in names)

@@ -10,8 +10,8 @@ from ..learners.td3 import TD3, TD3_NETWORK, ddpg
 from ..networks.exploration import GaussianNoise
 from ..networks.mlp import MLP, Critic
 from .base import Cell, Experiment
-from .dissertation import notes, told
-from .fig_5_3 import MEASURES, TABLE, Plan, cell, curves
+from .mujoco import MEASURES, TABLE, cell, curves
+from .plans import Plan
 from .views import published
 
 SWING, BALANCE = "Pendulum-v1", "InvertedPendulum-v5"
@@ -46,7 +46,7 @@ def cells(budget: str) -> list[Cell]:
             OffPolicy.td3,
             task,
             budget,
-            planned=Plan(frames, runs),
+            runs=Plan(frames, runs),
             network=network,
             learner=learner,
             start_frames=min(start if task == SWING else 1_000, frames // 2),
@@ -59,10 +59,5 @@ def cells(budget: str) -> list[Cell]:
 
 LEVELS = {f"{x}, Zoo": published("return", number=True, method=f"{x} alone") for x in learners()}
 LEVELS["upper bound"] = published("upper bound")
-EXPERIMENT = Experiment(
-    **told("check-learners", "mujoco"),
-    budgets=tuple(PLANS),
-    cells=cells,
-    measures=MEASURES,
-    views=(curves(**LEVELS), TABLE, notes("mujoco", "check-learners")),
-)
+VIEWS = (curves(**LEVELS), TABLE)
+EXPERIMENTS = {"check-learners": Experiment(cells, MEASURES, VIEWS, PLANS)}

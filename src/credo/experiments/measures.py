@@ -7,7 +7,7 @@ run, as it was tested.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -17,13 +17,13 @@ from jaxtyping import PyTree
 
 from .. import tree
 from ..algorithms.lineage import MAKERS
-from ..analysis import attribution, planner, statistics
+from ..analysis import attribution, bounds, statistics
 from ..environments.gymnasium import close_all
 from ..environments.rover import Rover
 from ..environments.wrappers import DelayedHostReward
 from ..networks.exploration import Explorer, GaussianNoise
 from ..networks.mlp import MLP
-from ..report.rows import Row, Series, rows, series
+from ..report.rows import Row, Series
 from ..report.run_page import learner_names
 from ..rollout import evaluate
 from ..runs.loop import Run
@@ -38,27 +38,44 @@ def undelayed(env: Any) -> Any:
     return env.env if isinstance(env, DelayedHostReward) else env
 
 
+def where(measure: Measure, **labels: Any) -> Measure:
+    """A measurement of cells with these labels alone; `name=None`: that have none of the name."""
+
+    def of_some(cell: Trained) -> Iterable[Row | Series]:
+        chosen = all(cell.labels.get(name) == value for name, value in labels.items())
+        return measure(cell) if chosen else ()
+
+    return of_some
+
+
 # --------------------------------------------------------------------------- the final champions
 
 
-def returns(env: Any, policies: PyTree, episodes: int, key: int) -> np.ndarray:
-    """What the task reports of `[policies, episodes]`, without noise, in the same worlds."""
-    played = evaluate(env, policies, episodes, key=jax.random.key(key)).of(env.reported)
+def returns(
+    env: Any, policies: PyTree, episodes: int, key: int = FINAL_KEY, reward: str | None = None
+) -> np.ndarray:
+    """A reward of the task, or what it reports, of `[policies, episodes]`, without noise, in the
+    same worlds."""
+    played = evaluate(env, policies, episodes, key=jax.random.key(key)).of(reward or env.reported)
     close_all()  # simulators of dozens of episodes
     return np.asarray(played)
 
 
 def final(
-    metric: str = "return", episodes: int = 10, digits: int = 2, each: bool = True
+    metric: str = "return",
+    episodes: int = 10,
+    digits: int = 2,
+    each: bool = True,
+    reward: str | None = None,
 ) -> Measure:
     """The final champions on fresh episodes that they share: a row for `each` episode, or the
-    mean over all."""
+    mean over all. `reward`: a reward of the task; None: what it reports."""
 
     def measure(cell: Trained) -> list[Row]:
-        played = returns(cell.env, cell.champions, episodes, FINAL_KEY)
-        axes = {"seed": cell.seeds} | ({"episode": None} if each else {})
-        values = played if each else np.mean(played, axis=1)
-        return rows(metric, attribution.plain(values, digits), cell.labels, **axes)
+        played = returns(cell.env, cell.champions, episodes, reward=reward)
+        if each:
+            return cell.rows(metric, played, digits, episode=None)
+        return cell.rows(metric, np.mean(played, axis=1), digits)
 
     return measure
 
@@ -83,8 +100,7 @@ def scores(x: str = "frames", points: int = 100, digits: int = 2) -> Measure:
         grid = attribution.axis(xs, points)
         tested = [run.metrics["champion_score"] for run in cell.runs]
         values = [attribution.on_grid(at, y, grid) for at, y in zip(xs, tested, strict=True)]
-        found = attribution.plain(values, digits)
-        return series("test score", x, grid.astype(int), found, cell.labels, seed=cell.seeds)
+        return cell.series("test score", (x, grid.astype(int)), values, digits)
 
     return measure
 
@@ -92,25 +108,17 @@ def scores(x: str = "frames", points: int = 100, digits: int = 2) -> Measure:
 def last_tests(cell: Trained) -> list[Row]:
     """The last test of each run, as logged and smoothed over generations."""
     tested = [run.metrics["champion_score"] for run in cell.runs]
-    found = {
-        "last test": tested,
-        "last test, smoothed": [statistics.moving_average(x, SMOOTHED) for x in tested],
-    }
-    return [
-        row
-        for metric, values in found.items()
-        for row in _per_run(cell, metric, attribution.plain([x[-1] for x in values], 2))
-    ]
+    smoothed = [statistics.moving_average(x, SMOOTHED)[-1] for x in tested]
+    last = cell.rows("last test", [x[-1] for x in tested], 2)
+    return last + cell.rows("last test, smoothed", smoothed, 2)
 
 
 def effort(cell: Trained) -> list[Row]:
     """Frames that each run took, and gradient updates for each of them."""
     metrics = [run.metrics for run in cell.runs]
     updates = [m["updates"].sum() / m["frames"][-1] if "updates" in m else np.nan for m in metrics]
-    return [
-        *_per_run(cell, "frames", [int(m["frames"][-1]) for m in metrics]),
-        *_per_run(cell, "updates per frame", attribution.plain(updates, 3)),
-    ]
+    frames = cell.rows("frames", [int(m["frames"][-1]) for m in metrics])
+    return frames + cell.rows("updates per frame", updates, 3)
 
 
 def first(metric: str, level: float, x: str) -> Measure:
@@ -121,37 +129,24 @@ def first(metric: str, level: float, x: str) -> Measure:
         for run in cell.runs:
             reached = np.flatnonzero(run.metrics["champion_score"] >= level)
             found.append(int(over(run, x)[reached[0]]) if reached.size else None)
-        return _per_run(cell, metric, found)
+        return cell.rows(metric, found)
 
     return measure
-
-
-def _per_run(cell: Trained, metric: str, values: Any) -> list[Row]:
-    return rows(metric, values, cell.labels, seed=cell.seeds)
 
 
 def lineage(cell: Trained) -> list[Row | Series]:
     """Who made the champions of hybrids: which operator changed them last, which learner their
     weights come from, and how workers were allocated."""
     found = attribution.summary([run.metrics for run in cell.runs])
-    names = learner_names(cell.cell.algorithm.learners)
-    curves = {
-        "last changed by": ("makers", {"operator": MAKERS}),
-        "ancestry": ("ancestry", {"ancestor": [*names, "first draw"]}),
-        "allocation so far": ("allocation", {"learner": names}),
-    }
-    shares = {
-        "allocation": ("allocated", {"learner": names}),
-        "injected": ("injected", {"learner": names}),
-        "fate": ("fates", {"learner": names, "fate": attribution.FATES}),
-    }
-    made: list[Row | Series] = []
-    for metric, (key, axes) in curves.items():
-        told = {"seed": cell.seeds} | axes
-        made += series(metric, "frames", found["frames"], found[key], cell.labels, **told)
-    for metric, (key, axes) in shares.items():
-        made += rows(metric, found[key], cell.labels, seed=cell.seeds, **axes)
-    return made
+    names, at = learner_names(cell.cell.algorithm.learners), ("frames", found["frames"])
+    return [
+        *cell.series("last changed by", at, found["makers"], operator=MAKERS),
+        *cell.series("ancestry", at, found["ancestry"], ancestor=[*names, "first draw"]),
+        *cell.series("allocation so far", at, found["allocation"], learner=names),
+        *cell.rows("allocation", found["allocated"], learner=names),
+        *cell.rows("injected", found["injected"], learner=names),
+        *cell.rows("fate", found["fates"], learner=names, fate=attribution.FATES),
+    ]
 
 
 def of_portfolio(cell: Trained) -> list[Row | Series]:
@@ -165,12 +160,7 @@ def of_portfolio(cell: Trained) -> list[Row | Series]:
 
 def of_task(numbers: Callable[[Any], dict[str, float]]) -> Measure:
     """Numbers of a cell's task, without a seed: baselines, bounds."""
-
-    def measure(cell: Trained) -> list[Row]:
-        found = numbers(undelayed(cell.env))
-        return [row for metric, x in found.items() for row in rows(metric, x, cell.labels)]
-
-    return measure
+    return lambda cell: [cell.fact(*found) for found in numbers(undelayed(cell.env)).items()]
 
 
 @functools.cache
@@ -191,5 +181,5 @@ def rover_baselines(env: Rover) -> dict[str, float]:
 
 @functools.cache
 def _rover_baselines(env: Rover) -> dict[str, float]:
-    found = planner.floors_and_ceilings(env, 50, key=jax.random.key(BASELINE_KEY))
-    return {name: round(float(np.mean([row[name] for row in found])), 3) for name in found[0]}
+    found = bounds.baselines(env) | {"bound": bounds.upper_bound(env).value}
+    return {name: round(value, 3) for name, value in found.items()}

@@ -9,7 +9,7 @@ The content of a table's cell is a function of the rows that belong to its row: 
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,23 +20,24 @@ from ..report.rows import Label, Labels, Results
 from .base import Value, named
 
 Of = Callable[[Results, Sequence[Value]], page.Cell]  # what a table shows of some rows
+SEED = "seed"  # the label of a table that has a row for each run
 
 
 # ----------------------------------------------------------------------- what a cell of a table has
 
 
 def per_seed(results: Results, metric: str) -> dict[int, float]:
-    """A metric's mean over all rows of each seed (episodes, agents, …); NaN where all are null. Of
-    a series the last point."""
-    found: dict[int, list[float]] = {}
-    for seed, values in results.by_seed(metric).items():
-        if seed is not None:
-            found[seed] = [np.nan if value is None else float(value) for value in values]
+    """A metric's mean over all rows of each seed (episodes, agents, …); NaN where one of them is
+    null. Of a series the last point."""
+    every = results.by_seed(metric)
     for curve in results.curves:
-        if curve.metric == metric and curve.seed is not None:
-            last = curve.values[-1]
-            found.setdefault(curve.seed, []).append(np.nan if last is None else float(last))
-    return {seed: float(np.mean(values)) for seed, values in found.items()}
+        if curve.metric == metric:
+            every.setdefault(curve.seed, []).append(curve.values[-1])
+    return {
+        seed: float(np.mean([number(value) for value in values]))
+        for seed, values in every.items()
+        if seed is not None
+    }
 
 
 def mean(metric: str, scale: float = 1.0, digits: int | None = None, **labels: Any) -> Of:
@@ -44,22 +45,48 @@ def mean(metric: str, scale: float = 1.0, digits: int | None = None, **labels: A
 
     def of(results: Results, values: Sequence[Value]) -> page.Cell:
         found = per_seed(results.where(**labels), metric)
-        if not any(np.isfinite(list(found.values()))):
-            return None
         given = [value if np.isfinite(value) else None for value in found.values()]
-        return page.Summary(given, list(found), scale, digits)
+        there = any(value is not None for value in given)
+        return page.Summary(given, list(found), scale, digits) if there else None
+
+    return of
+
+
+def of_runs(metric: str, function: Callable[[np.ndarray], page.Cell], **labels: Any) -> Of:
+    """What a function makes of the mean of each run over its rows, `[runs]`."""
+
+    def of(results: Results, values: Sequence[Value]) -> page.Cell:
+        found = per_seed(results.where(**labels), metric)
+        return function(np.array(list(found.values()))) if found else None
 
     return of
 
 
 def plain(metric: str, scale: float = 1.0, of: Callable[[Any], Any] = np.mean, **labels: Any) -> Of:
     """The mean over runs alone, or their median (`of=np.median`), without interval and runs."""
+    return of_runs(metric, lambda x: scale * float(of(x)), **labels)
 
-    def content(results: Results, values: Sequence[Value]) -> page.Cell:
-        found = list(per_seed(results.where(**labels), metric).values())
-        return scale * float(of(found)) if found else None
 
-    return content
+def median(metric: str, scale: float = 1.0) -> Of:
+    """Median and range over runs; of one run just its value."""
+
+    def told(x: np.ndarray) -> page.Cell:
+        x = scale * x[np.isfinite(x)]
+        if x.size < 2:
+            return f"{x[0]:.1f}" if x.size else None
+        return f"{np.median(x):.1f} ({x.min():.1f}…{x.max():.1f})"
+
+    return of_runs(metric, told)
+
+
+def best(metric: str, scale: float = 1.0) -> Of:
+    """The best of all runs."""
+    return of_runs(metric, lambda x: f"{scale * np.nanmax(x):.1f}")
+
+
+def count(metric: str, test: Callable[[Any], bool]) -> Of:
+    """How many runs pass a test of a metric: "2 of 3"."""
+    return of_runs(metric, lambda x: f"{sum(map(test, x))} of {len(x)}")
 
 
 def each(metric: str, none: str = "never", form: str = ",", **labels: Any) -> Of:
@@ -69,16 +96,6 @@ def each(metric: str, none: str = "never", form: str = ",", **labels: Any) -> Of
         found = results.where(**labels).by_seed(metric)
         told = [x for seed, several in found.items() if seed is not None for x in several]
         return ", ".join(none if x is None else f"{x:{form}}" for x in told) or None
-
-    return of
-
-
-def count(metric: str, test: Callable[[Any], bool], **labels: Any) -> Of:
-    """How many runs pass a test of a metric: "2 of 3"."""
-
-    def of(results: Results, values: Sequence[Value]) -> page.Cell:
-        found = list(per_seed(results.where(**labels), metric).values())
-        return f"{sum(map(test, found))} of {len(found)}" if found else None
 
     return of
 
@@ -95,9 +112,9 @@ def known(metric: str, scale: float = 1.0, **labels: Any) -> Of:
     return of
 
 
-def published(metric: str, sourced: bool = False, number: bool = False, **labels: Any) -> Of:
-    """What was published of these rows, the most particular first; None if nothing was.
-    `sourced`: with its source. `number`: without its spread, for a figure's level."""
+def published(metric: str, number: bool = False, **labels: Any) -> Of:
+    """What was published of these rows, the most particular first, with its spread; None if nothing
+    was. `number`: the number alone, for a figure's level."""
 
     def of(results: Results, values: Sequence[Value]) -> page.Cell:
         chosen = results.where(**labels)
@@ -110,60 +127,32 @@ def published(metric: str, sourced: bool = False, number: bool = False, **labels
             and not (number and isinstance(value.value, str))
             and any(value.labels.items() <= told.items() for told in every)
         ]
-        if not found:
-            return None
-        best = max(found, key=lambda value: len(value.labels))
-        if number or not (best.spread or sourced):
-            return best.value
-        text = best.value if isinstance(best.value, str) else f"{best.value:,.6g}"
-        return " ".join([text, best.spread][: 2 if best.spread else 1]) + (
-            f" ({best.source})" if sourced else ""
+        best = max(found, key=lambda value: len(value.labels), default=None)
+        if best is None or number or not best.spread:
+            return best and best.value
+        return (
+            f"{best.value if isinstance(best.value, str) else f'{best.value:,.6g}'} {best.spread}"
         )
 
     return of
 
 
-def computed(metric: str, function: Callable[[np.ndarray], page.Cell], **labels: Any) -> Of:
-    """What a function makes of a metric's values `[seeds, values of each]`; of a series the last
-    point counts."""
+def computed(metric: str, function: Callable[[np.ndarray], page.Cell]) -> Of:
+    """What a function makes of a metric's values `[seeds, values of each]`."""
 
     def of(results: Results, values: Sequence[Value]) -> page.Cell:
-        chosen = results.where(**labels)
-        every = {seed: x for seed, x in chosen.by_seed(metric).items() if seed is not None}
-        every = every or {seed: [x] for seed, x in per_seed(chosen, metric).items()}
-        return function(np.array(list(every.values()), np.float64)) if every else None
+        found = [x for seed, x in results.by_seed(metric).items() if seed is not None]
+        return function(np.array(found, np.float64)) if found else None
 
     return of
-
-
-def median(metric: str, scale: float = 1.0, **labels: Any) -> Of:
-    """Median and range over runs; of one run just its value."""
-
-    def told(x: np.ndarray) -> page.Cell:
-        x = scale * np.mean(x, axis=1)
-        x = x[np.isfinite(x)]
-        if x.size < 2:
-            return f"{x[0]:.1f}" if x.size else None
-        return f"{np.median(x):.1f} ({x.min():.1f}…{x.max():.1f})"
-
-    return computed(metric, told, **labels)
-
-
-def best(metric: str, scale: float = 1.0) -> Of:
-    """The best of all runs."""
-    return computed(metric, lambda x: f"{scale * np.nanmax(np.mean(x, axis=1)):.1f}")
 
 
 def at(x: float, content: Of) -> Of:
     """What a content is of series that end at `x`; None if no series has a point there."""
 
     def of(results: Results, values: Sequence[Value]) -> page.Cell:
-        curves = [
-            curve._replace(at=curve.at[: i + 1], values=curve.values[: i + 1])
-            for curve in results.curves
-            for i in [list(curve.at).index(x) if x in curve.at else None]
-            if i is not None
-        ]
+        ends = [(y, list(y.at).index(x) + 1) for y in results.curves if x in y.at]
+        curves = [y._replace(at=y.at[:end], values=y.values[:end]) for y, end in ends]
         return content(replace(results, curves=curves), values)
 
     return of
@@ -178,58 +167,44 @@ def constant(value: float | str) -> Of:
 
 
 @dataclass(frozen=True)
-class Runs:
-    """A row for each run, in order of the seeds; a table for each combination of `panel`, which
-    `{panel}` in the title tells."""
-
-    title: str
-    columns: Mapping[str, Of]
-    panel: Sequence[str] = ()
-    where: Labels = field(default_factory=dict)
-    caption: str = ""
-
-    def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
-        chosen = results.where(**self.where)
-        for key in combinations(chosen, self.panel):
-            told = dict(zip(self.panel, key, strict=True))
-            here = chosen.where(**told)
-            body = [
-                [str(seed), *(of(of_seed(here, seed), values) for of in self.columns.values())]
-                for seed in dict.fromkeys(x.seed for x in [*here.rows, *here.curves])
-                if seed is not None
-            ]
-            title = self.title.format(panel=named(present(told)))
-            if body:
-                yield page.Table(title, ["seed", *self.columns], body, caption=self.caption)
-
-
-@dataclass(frozen=True)
 class Table:
-    """A row of cells for each combination of the labels `rows`; `columns` by their title. `where`:
-    only what has these labels. `titles`: a heading for a label, where its name is not one."""
+    """A row of cells for each combination of the labels `rows`, or for each run (`rows=[SEED]`);
+    `columns` by their title. `panel`: labels of which each combination has a table of its own; the
+    title may have them in it as `{panel}`. `where`: only what has these labels. `titles`: a heading
+    for a label, where its name is not one.
+
+    A column that says nothing anywhere, such as a label that no cell has, is left out.
+    """
 
     title: str
     rows: Sequence[str]
     columns: Mapping[str, Of]
     where: Mapping[str, Any] = field(default_factory=dict)
+    panel: Sequence[str] = ()
     titles: Mapping[str, str] = field(default_factory=dict)
     caption: str = ""
 
     def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
-        chosen = results.where(**self.where)
-        body = []
-        for key in combinations(chosen, self.rows):
-            here = chosen.where(**dict(zip(self.rows, key, strict=True)))
-            contents = [of(here, values) for of in self.columns.values()]
-            if any(content is not None for content in contents):
-                body.append([*map(label_text, key), *contents])
         headings = [self.titles.get(name, name) for name in self.rows] + list(self.columns)
-        # A column that says nothing anywhere, such as a label that no cell has, is left out.
-        kept = [any(row[i] is not None for row in body) for i in range(len(headings))]
-        body = [list(itertools.compress(row, kept)) for row in body]
-        if body:
+        for told, chosen in panels(results.where(**self.where), self.panel):
+            body = []
+            for key, here in self.places(chosen):
+                contents = [of(here, values) for of in self.columns.values()]
+                if any(content is not None for content in contents):
+                    body.append([*map(label_text, key), *contents])
+            kept = [any(row[i] is not None for row in body) for i in range(len(headings))]
+            body = [list(itertools.compress(row, kept)) for row in body]
             columns = list(itertools.compress(headings, kept))
-            yield page.Table(self.title, columns, body, caption=self.caption)
+            if body:
+                yield page.Table(titled(self.title, told), columns, body, caption=self.caption)
+
+    def places(self, results: Results) -> Iterator[tuple[Sequence[Any], Results]]:
+        """What belongs to each row."""
+        if list(self.rows) == [SEED]:
+            seeds = dict.fromkeys(x.seed for x in [*results.rows, *results.curves])
+            yield from (([str(x)], of_seed(results, x)) for x in seeds if x is not None)
+        else:
+            yield from ((tuple(x.values()), here) for x, here in panels(results, self.rows))
 
 
 @dataclass(frozen=True)
@@ -250,79 +225,51 @@ class Curves:
     y_label: str = ""
     levels: Mapping[str, Of] = field(default_factory=dict)
     where: Mapping[str, Any] = field(default_factory=dict)
-    scale: float = 1.0
-    log_x: bool = False
     y_range: tuple[float, float] | None = None
     caption: str = ""
 
     def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
-        chosen = of_metric(results.where(**self.where), self.y)
-        measured = [*chosen.rows, *chosen.curves]
-        for key in combinations(chosen, self.panel) if measured else []:
-            told = dict(zip(self.panel, key, strict=True))
-            here, everything = chosen.where(**told), results.where(**{**self.where, **told})
-            lines = [dict(zip(self.line, x, strict=True)) for x in combinations(here, self.line)]
-            curves = [
-                self.curve(here.where(**line), words or self.y)
-                for line, words in zip(lines, differing(lines), strict=True)
-            ]
-            title = titled(self.title, told)
-            levels = [(name, of(everything, values)) for name, of in self.levels.items()]
+        every = results.where(**self.where)
+        chosen = of_metric(every, self.y)
+        for told, here in panels(chosen, self.panel) if chosen.rows or chosen.curves else ():
+            lines = list(panels(here, self.line))
+            names = differing([labels for labels, _ in lines])
+            levels = {name: of(every.where(**told), values) for name, of in self.levels.items()}
             yield page.Figure(
-                title,
+                titled(self.title, told),
                 self.x,
                 self.y_label or self.y,
-                curves,
-                [page.Reference(name, x) for name, x in levels if isinstance(x, int | float)],
+                [self.curve(x, name or self.y) for (_, x), name in zip(lines, names, strict=True)],
+                [page.Reference(k, x) for k, x in levels.items() if isinstance(x, int | float)],
                 self.caption,
-                self.log_x,
-                self.y_range,
+                y_range=self.y_range,
                 joined=bool(here.curves),
             )
 
     def curve(self, results: Results, label: str) -> page.Curve:
         """One line, of every seed."""
         if results.curves:
-            return page.Curve(
-                label,
-                results.curves[0].at,
-                [[number(y, self.scale) for y in curve.values] for curve in results.curves],
-            )
+            runs = [[number(y) for y in curve.values] for curve in results.curves]
+            return page.Curve(label, results.curves[0].at, runs)
         xs = sorted({row.labels[self.x] for row in results.rows})
         found = [per_seed(results.where(**{self.x: x}), self.y) for x in xs]
         seeds = dict.fromkeys(seed for place in found for seed in place)
         runs = [[place.get(seed, np.nan) for place in found] for seed in seeds]
-        return page.Curve(label, xs, self.scale * np.array(runs, np.float64))
-
-
-@dataclass(frozen=True)
-class Notes:
-    """What to know before comparing. A paragraph may be a function of the results, and may have
-    nothing to say (None)."""
-
-    paragraphs: Sequence[str | Callable[[Results], str | None]]
-    title: str = "How to read it"
-
-    def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Section]:
-        told = [text if isinstance(text, str) else text(results) for text in self.paragraphs]
-        yield page.Text(self.title, [text for text in told if text is not None])
-
-
-def where(text: str, **labels: Any) -> Callable[[Results], str | None]:
-    """A paragraph that stands only on pages with such cells."""
-    return lambda results: text if results.where(**labels).cells else None
+        return page.Curve(label, xs, runs)
 
 
 # --------------------------------------------------------------------------------------- helpers
 
 
-def combinations(results: Results, names: Sequence[str]) -> list[tuple[Any, ...]]:
-    """What these labels are together, in order of appearance; None where a cell has none of the
-    name. Without names, one combination of none if there is anything at all."""
+def panels(results: Results, names: Sequence[str]) -> Iterator[tuple[dict[str, Any], Results]]:
+    """What these labels are together, in order of appearance, and what has them; None where there
+    is no label of the name. Without names, all results if there are any at all."""
     every: list[Labels] = [cell["labels"] for cell in results.cells]
     every = [item.labels for item in [*results.rows, *results.curves]] or every
-    found = dict.fromkeys(tuple(labels.get(name) for name in names) for labels in every)
-    return [key for key in found if not names or any(x is not None for x in key)]
+    for key in dict.fromkeys(tuple(labels.get(name) for name in names) for labels in every):
+        if not names or any(x is not None for x in key):
+            told = dict(zip(names, key, strict=True))
+            yield told, results.where(**told)
 
 
 def of_metric(results: Results, metric: str) -> Results:
@@ -368,6 +315,6 @@ def label_text(value: Any) -> page.Cell:
     return f"{value:g}" if isinstance(value, float) else value
 
 
-def number(value: Any, scale: float = 1.0) -> float:
+def number(value: Any) -> float:
     """A value of a series; NaN for null."""
-    return np.nan if value is None else scale * float(value)
+    return np.nan if value is None else float(value)

@@ -95,7 +95,7 @@ class UCB(AbstractManager):
         value = above / (jnp.sum(above) + 0.1)
         total = jnp.maximum(jnp.sum(ledger.count), 1).astype(jnp.float32)
         tried = jnp.maximum(ledger.count, 1).astype(jnp.float32)
-        # A floor, so that c = 0 and equal values still are a distribution.
+        # A least share, so that c = 0 and equal values still are a distribution.
         return value + self.exploration * jnp.sqrt(jnp.log(total) / tried) + 1e-6
 
 

@@ -31,10 +31,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from .. import require, tree
 from .base import INITIALIZERS, AbstractNetwork, AbstractPolicy
 from .mmu import MMU, MMUPolicy
-from .recurrent import GATES, Recurrent, RecurrentPolicy
-
-ORDERS = ("sequential", "simultaneous", "random")
-ACCESS = ("everyone", "present", "acting")
+from .recurrent import Recurrent, RecurrentPolicy
 
 
 class DMMU(AbstractNetwork):
@@ -76,18 +73,15 @@ class DMMU(AbstractNetwork):
         for size in sizes:
             require.at_least("hidden", size, 1)
         require.at_least("memory", self.cells, 1)
-        require.choice("cell", self.cell, ("mmu", *GATES))
+        require.literals(self)
         if self.cell != "mmu" and any(size != self.cells for size in sizes):
             raise ValueError(
                 f"hidden is {self.hidden} and memory is {self.cells}: agents of cell "
                 f"{self.cell!r} have one unit for each memory cell; give one number for both, or "
                 "cell='mmu'"
             )
-        require.choice("order", self.order, ORDERS)
-        require.choice("access", self.access, ACCESS)
         require.choice("initializer", self.initializer, INITIALIZERS)
         require.at_least("bias_std", self.bias_std, 0)
-        require.choice("start_weights", self.start_weights, ("drawn", "shut"))
         if self.start_weights == "shut" and self.cell != "mmu":
             raise ValueError(
                 f"start_weights is 'shut' and cell is {self.cell!r}: only MMUs have write gates; "
@@ -194,12 +188,12 @@ class DMMUPolicy(AbstractPolicy):
     def without(self, agents: Sequence[int]) -> "DMMUPolicy":
         """The team that is left when those at these indices go, in the same order.
 
-        Also of a population. ValueError if there is no such agent, or nobody would be left.
+        Also of a population. ValueError if there is no such agent, or none would be left.
         """
         self._check(agents)
         left = [i for i in range(len(self.agents)) if i not in set(agents)]
         if not left:
-            raise ValueError(f"without agents {sorted(set(agents))} nobody is left: keep one")
+            raise ValueError(f"without agents {sorted(set(agents))} no agent is left: keep one")
         return self._of(left)
 
     def with_clones(self, agents: Sequence[int]) -> "DMMUPolicy":

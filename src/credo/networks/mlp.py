@@ -21,7 +21,6 @@ from .base import (
 )
 from .values import AbstractValues, Mean
 
-NORMALIZATIONS = ("none", "before", "after")
 EPSILON = 1e-6  # of LayerNorm, relative to the variance
 
 
@@ -42,7 +41,6 @@ class MLP(AbstractNetwork):
 
     def __check_init__(self):
         _check(self)
-        require.choice("output_activation", self.output_activation, ("sigmoid", "tanh"))
 
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> "MLPPolicy":
         sizes = (obs_size, *self.hidden, action_size)
@@ -278,5 +276,5 @@ def _check(config: MLP | Critic) -> None:
     for i, units in enumerate((*config.hidden, *getattr(config, "branches", ()))):
         require.at_least(f"hidden[{i}]", units, 1)
     require.choice("activation", config.activation, ACTIVATIONS)
-    require.choice("normalization", config.normalization, NORMALIZATIONS)
+    require.literals(config)
     require.choice("initializer", config.initializer, (*INITIALIZERS, "uniform"))

@@ -33,8 +33,6 @@ from .base import (
     to_action,
 )
 
-STARTS = ("drawn", "saturated", "closed", "open")
-
 
 class MMU(AbstractNetwork):
     """Config of an MMU. All sizes are independent once encoder and decoder are learned."""
@@ -79,13 +77,9 @@ class MMU(AbstractNetwork):
         require.at_least("hidden", self.hidden, 1)
         require.at_least("memory", self.cells, 1)
         require.within("alpha", self.alpha, 0, 1)
-        require.choice("encoder", self.encoder, ("identity", "learned"))
-        require.choice("decoder", self.decoder, ("identity", "learned"))
+        require.literals(self)
         for name in ("block_activation", "decoder_activation", "encoder_activation"):
             require.choice(name, getattr(self, name), ACTIVATIONS)
-        require.choice("output_activation", self.output_activation, ("sigmoid", "tanh"))
-        require.choice("start_weights", self.start_weights, STARTS)
-        require.choice("start_memory", self.start_memory, ("learned", "zero"))
         require.choice("initializer", self.initializer, INITIALIZERS)
         if "identity" in (self.encoder, self.decoder) and self.cells != self.hidden:
             raise ValueError(

@@ -37,9 +37,8 @@ class Recurrent(AbstractNetwork):
     """Fresh weights: normal, fan_in or kaiming."""
 
     def __check_init__(self):
-        require.choice("cell", self.cell, GATES)
+        require.literals(self)
         require.at_least("hidden", self.hidden, 1)
-        require.choice("output_activation", self.output_activation, ("sigmoid", "tanh"))
         require.choice("initializer", self.initializer, INITIALIZERS)
 
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> "RecurrentPolicy":

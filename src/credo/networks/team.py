@@ -49,7 +49,7 @@ class Team(AbstractNetwork):
     def __check_init__(self):
         for i, units in enumerate(self.trunk):
             require.at_least(f"trunk[{i}]", units, 1)
-        require.choice("sharing", self.sharing, ("trunk", "everything", "nothing"))
+        require.literals(self)
         require.choice("activation", self.activation, ACTIVATIONS)
         require.choice("initializer", self.initializer, (*INITIALIZERS, "uniform"))
 
@@ -60,17 +60,15 @@ class Team(AbstractNetwork):
         sizes = (obs_size, *self.trunk)
         trunks = 1 if self.sharing != "nothing" else agents
         heads = 1 if self.sharing == "everything" else agents
+        drawn = eqx.filter_vmap(lambda key: self.head.init(sizes[-1], action_size, key=key))(
+            jax.random.split(head_key, heads)
+        )
         return TeamPolicy(
             tuple(
                 draw_layers(sizes, self.initializer, key=key)
                 for key in jax.random.split(trunk_key, trunks)
             ),
-            _each_row(
-                eqx.filter_vmap(lambda key: self.head.init(sizes[-1], action_size, key=key))(
-                    jax.random.split(head_key, heads)
-                ),
-                heads,
-            ),
+            tuple(tree.take(drawn, i) for i in range(heads)),
             self,
             agents,
         )
@@ -142,11 +140,6 @@ class TeamPolicy(AbstractPolicy):
         )
         axes = (*axes, *(0 for _ in rest))
         return eqx.filter_vmap(function, in_axes=axes, axis_size=self.agents)(*parts, *rest)
-
-
-def _each_row(rows: PyTree, n: int) -> tuple[PyTree, ...]:
-    """The other way round, and of one as well."""
-    return tuple(tree.take(rows, i) for i in range(n))
 
 
 def _rows(one_of: tuple[PyTree, ...]) -> PyTree:

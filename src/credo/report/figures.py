@@ -1,11 +1,11 @@
-"""Figures of a page drawn with matplotlib: SVG for pages, PNG for the rest."""
+"""Figures of a page drawn with matplotlib, as SVG that stands in a page or in a file."""
 
 import io
+import itertools
 import math
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from html import escape
 from typing import Any, NamedTuple
@@ -21,13 +21,13 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text as Words
-from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, MaxNLocator
 from matplotlib.transforms import offset_copy
 from numpy.typing import NDArray
 
-from . import statistics
 from .sections import Curve, Figure, HeatMap, Reference, Tracks
-from .styles import DARK, DASHES, LIGHT, STYLE, Look, Theme, assign
+from .styles import DASHES, Look, Theme, assign
+from .tables import mean
 
 Floats = NDArray[np.float64]
 Plot = Figure | HeatMap | Tracks
@@ -52,35 +52,46 @@ class Picture(NamedTuple):
     tips: dict[str, Any] | None
 
 
+class Sampled(NamedTuple):
+    """What is drawn of a curve: `x`, `centre`, `low`, `high` `[points]`, `runs[seeds, points]`."""
+
+    x: Floats
+    runs: Floats
+    centre: Floats
+    low: Floats
+    high: Floats
+
+
 def picture(
-    figure: Plot,
-    dark: bool = False,
-    *,
-    prefix: str = "",
-    looks: Looks | None = None,
-    legend: bool = True,
+    figure: Plot, theme: Theme, *, prefix: str = "", looks: Looks | None = None, legend: bool = True
 ) -> Picture:
     """The figure, without its title, as an `<svg>` element that scales with its box.
 
-    Text stays text. Every id begins with `prefix`: several figures in one page need different
-    ones, or their clip paths are mixed up. The background is transparent. `looks`: of curves by
-    their label, as in the other figures of the page; None: of this figure alone. `legend`: whether
-    the picture has one; that of tracks always has.
+    Text stays text, and the background is transparent.
+
+    **Arguments:**
+
+    - `prefix`: of every id; several figures in one page need different ones, or their clip paths
+      are mixed up.
+    - `looks`: of curves by their label, as in the other figures of the page; None: of this figure
+      alone.
+    - `legend`: whether the picture has one; that of tracks always has.
     """
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(theme.rc):
         text = io.StringIO()
-        canvas = draw(figure, DARK if dark else LIGHT, looks, legend)
+        canvas = draw(figure, theme, looks, legend)
         canvas.savefig(text, format="svg", transparent=True)
-        return Picture(
-            inline(text.getvalue(), description(figure), prefix), tips(figure, canvas.axes[0])
-        )
+    return Picture(
+        inline(text.getvalue(), description(figure), prefix), tips(figure, canvas.axes[0])
+    )
 
 
 # ------------------------------------------------------------------------------- what it says
 
 
 def note(figure: Plot) -> str:
-    """How to read the figure: what its lines, bands and colours stand for."""
+    """How to read the figure, below it: what its lines, bands and colours stand for, which curves
+    lie on each other, and whether points were left out. "" where there is nothing to say."""
     if isinstance(figure, HeatMap):
         missing = not np.isfinite(np.asarray(figure.values, dtype=np.float64)).all()
         return "Grey: no value." if missing else ""
@@ -90,12 +101,8 @@ def note(figure: Plot) -> str:
     parts = ["One run per line." if figure.joined else "One run per point."]
     if seeds[-1] > 1:
         count = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
-        centre = statistics.CENTRES[figure.centre][1]
         band, each = ("Band", "Thin lines") if figure.joined else ("Bars", "Dots")
-        parts = [
-            f"{centre.capitalize()} over {count} runs. {band}: its 95 % bootstrap interval. "
-            f"{each}: each run."
-        ]
+        parts = [f"Mean over {count} runs. {band}: its 95 % bootstrap interval. {each}: each run."]
     for group in coinciding(figure):
         *others, last = [figure.curves[i].label for i in group]
         parts.append(f"{', '.join(others)} and {last} coincide.")
@@ -106,30 +113,39 @@ def note(figure: Plot) -> str:
 
 
 def coinciding(figure: Figure) -> list[list[int]]:
-    """Indices of curves that lie on each other: nearly everywhere within half a percent of the
-    figure's height."""
-    drawn = [sampled(c, figure.centre, figure.log_x, drawn_points(figure)) for c in figure.curves]
+    """Indices of curves that lie on each other, each group in the order of the curves.
+
+    Two coincide if nine tenths of their points are within half a percent of the figure's height,
+    and they share half of the x-axis or more. A curve is compared with the first one of a group.
+    """
+    drawn = [sampled(c, drawn_points(figure)) for c in figure.curves]
     centres = np.concatenate([curve.centre for curve in drawn])
     levels = [level.value for level in figure.references]
     present = [*centres[np.isfinite(centres)], *levels] or [0.0]
     near = 0.005 * (max(present) - min(present))
     groups: list[list[int]] = []
     for i, curve in enumerate(drawn):
-        for group in groups:
-            other = drawn[group[0]]
-            inside = (curve.x >= other.x[0]) & (curve.x <= other.x[-1])
-            apart = np.abs(curve.centre - np.interp(curve.x, other.x, other.centre))[inside]
-            apart, count = apart[np.isfinite(apart)], np.isfinite(curve.centre).sum()
-            if 2 * len(apart) >= count > 0 and np.mean(apart <= near) >= 0.9:
-                group.append(i)
-                break
-        else:
+        alike = (group for group in groups if near_each_other(curve, drawn[group[0]], near))
+        group = next(alike, None)
+        if group is None:
             groups.append([i])
+        else:
+            group.append(i)
     return [group for group in groups if len(group) > 1]
 
 
+def near_each_other(curve: Sampled, other: Sampled, near: float) -> bool:
+    """Whether nine tenths of a curve are no further than `near` from another one, which is read
+    between its points. At least half of its points must lie beside the other curve."""
+    inside = (curve.x >= other.x[0]) & (curve.x <= other.x[-1])
+    apart = np.abs(curve.centre - np.interp(curve.x, other.x, other.centre))[inside]
+    apart, count = apart[np.isfinite(apart)], np.isfinite(curve.centre).sum()
+    return bool(2 * len(apart) >= count > 0 and np.mean(apart <= near) >= 0.9)
+
+
 def description(figure: Plot) -> str:
-    """One sentence for those who cannot see the figure."""
+    """One sentence for those who cannot see the figure: what is drawn against what, and the names
+    of curves and levels. It is the label of the `<svg>` element."""
     what = f"{figure.title}: " if figure.title else ""
     if isinstance(figure, HeatMap):
         rows, columns = np.shape(figure.values)
@@ -150,8 +166,12 @@ def description(figure: Plot) -> str:
 
 
 def tips(figure: Plot, axes: Axes) -> dict[str, Any] | None:
-    """What a tooltip tells, as JSON can hold it, and where in the picture: `box` is the axes' left,
-    top, width and height as shares of the picture's. None of tracks, beside which is a table."""
+    """What a tooltip tells, as JSON can hold it, for `static/page.js`.
+
+    `box` is the axes' left, top, width and height as shares of the picture's. Of curves, `x` is the
+    range of the axis and `curves` has their values in words; of a heat map, `rows` and `columns`
+    are names and `values[rows, columns]` words. None of tracks, beside which is a table.
+    """
     place = axes.get_position()
     box = [round(v, 4) for v in (place.x0, 1 - place.y1, place.width, place.height)]
     if isinstance(figure, HeatMap):
@@ -168,12 +188,13 @@ def tips(figure: Plot, axes: Axes) -> dict[str, Any] | None:
         return None
     range_ = [float(v) for v in axes.get_xlim()]
     curves = [curve_tips(curve, figure) for curve in figure.curves]
-    return {"box": box, "x": range_, "log": figure.log_x, "name": figure.x_label, "curves": curves}
+    return {"box": box, "x": range_, "name": figure.x_label, "curves": curves}
 
 
 def curve_tips(curve: Curve, figure: Figure) -> dict[str, Any]:
-    """The values of one curve in words, at some of its points."""
-    shown = sampled(curve, figure.centre, figure.log_x, drawn_points(figure))
+    """The values of one curve in words, at no more than `MOST_TIPS` of its points: the mean with
+    its interval, `0.53 [0.51, 0.55]`; "" where a seed has no value."""
+    shown = sampled(curve, drawn_points(figure))
     every = -(-len(shown.x) // MOST_TIPS)
     texts = []
     for value, low, high in zip(shown.centre, shown.low, shown.high, strict=True):
@@ -183,7 +204,11 @@ def curve_tips(curve: Curve, figure: Figure) -> dict[str, Any]:
 
 
 def inline(svg: str, label: str, prefix: str) -> str:
-    """matplotlib's SVG file as an element that can stand in a page beside others."""
+    """matplotlib's SVG file as an element that can stand in a page beside others.
+
+    **Arguments:** `svg`: the file's text; `label`: for those who cannot see the picture; `prefix`:
+    of every id, and of what refers to one.
+    """
     svg = svg[svg.index("<svg") :]
     # The style sheet would act on the whole page: its two rules move to the root.
     svg = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>|<style.*?</style>", "", svg, flags=re.S)
@@ -210,66 +235,61 @@ def compact(tag: str, prefix: str) -> str:
 
 
 def draw(figure: Plot, theme: Theme, looks: Looks | None = None, legend: bool = True) -> Canvas:
-    """The figure on a canvas of its own, with no title. Arguments as of `picture`."""
+    """The figure on a canvas of its own, with no title. Arguments as of `picture`, which sets the
+    theme's settings of matplotlib around it."""
     canvas = Canvas(figsize=(WIDTH, HEIGHT), layout="constrained")
     FigureCanvasAgg(canvas)  # measures text; saving as SVG brings its own
     axes = canvas.add_subplot()
-    axes.spines[["left", "bottom"]].set_color(theme.muted)
-    axes.tick_params(color=theme.muted, labelcolor=theme.ink)
-    axes.set_xlabel(textwrap.fill(figure.x_label, 54), color=theme.ink)
-    axes.set_ylabel(textwrap.fill(figure.y_label, 34), color=theme.ink)
+    axes.set_xlabel(textwrap.fill(figure.x_label, 54))
+    axes.set_ylabel(textwrap.fill(figure.y_label, 34))
     if isinstance(figure, HeatMap):
         draw_heat_map(canvas, axes, figure, theme)
-        return canvas
-    if isinstance(figure, Tracks):
-        handles = draw_tracks(canvas, axes, figure, theme)
+    elif isinstance(figure, Tracks):
+        add_legend(canvas, draw_tracks(canvas, axes, figure, theme))
     else:
-        handles = draw_curves(canvas, axes, figure, theme, looks)
-        legend = legend and any(curve.label.strip() for curve in figure.curves)
-    if legend or isinstance(figure, Tracks):
-        add_legend(canvas, handles, theme)
-    if isinstance(figure, Figure):
+        lines = draw_curves(canvas, axes, figure, theme, looks)
+        if legend:
+            named = zip(lines, figure.curves, strict=True)
+            add_legend(canvas, [line for line, curve in named if curve.label.strip()])
         label_references(canvas, axes, figure.references, theme)
     return canvas
 
 
 def draw_curves(
     canvas: Canvas, axes: Axes, figure: Figure, theme: Theme, looks: Looks | None
-) -> list[Artist]:
-    """All curves and levels; what stands for the named ones in the legend."""
-    looks = assign(curve.label for curve in figure.curves) if looks is None else looks
+) -> list[Line2D]:
+    """All curves and levels on one pair of axes.
+
+    **Returns:** the line of each curve, which stands for it in a legend. What belongs to curve `i`
+    has ids that begin with `curve-i-`, by which the page's script hides it.
+    """
+    looks = looks or assign(curve.label for curve in figure.curves)
     together = coinciding(figure)
-    lines: list[Artist] = []
+    lines: list[Line2D] = []
     for i, curve in enumerate(figure.curves):
-        inside = [len(group) - 1 - group.index(i) for group in together if i in group]
+        # Of curves that coincide each is drawn inside the one before; dots stand beside others'.
+        inside = sum(len(group) - 1 - group.index(i) for group in together if i in group)
         shift = 3.0 * (i - (len(figure.curves) - 1) / 2)  # points
-        look = Drawing(
-            color=theme.curves[looks[curve.label].color],
-            dashes=DASHES[looks[curve.label].dash],
-            # Of curves that coincide each is drawn inside the one before.
-            width=LINE + 2.0 * sum(inside),
-            transform=offset_copy(axes.transData, fig=canvas, x=shift, units="points"),
+        beside = offset_copy(axes.transData, fig=canvas, x=shift, units="points")
+        place = {} if figure.joined else {"transform": beside}
+        artists = draw_curve(
+            axes, curve, figure, theme, looks[curve.label], LINE + 2.0 * inside, place
         )
-        lines.append(draw_curve(axes, i, curve, figure, look))
-    axes.grid(axis="y", color=theme.grid)
+        for count, artist in enumerate(artists):
+            artist.set_gid(f"curve-{i}-{count}")
+        lines.append(artists[-1])
+    axes.grid(axis="y")
     axes.margins(x=0.02)
     scale(axes, figure)
     for line in figure.references:
         axes.axhline(line.value, color=theme.muted, linewidth=1, dashes=(4, 3), zorder=1.5)
-    named = zip(lines, figure.curves, strict=True)
-    return [line for line, curve in named if curve.label.strip()]
+    return lines
 
 
 def scale(axes: Axes, figure: Figure) -> None:
-    """Ticks that a reader expects, and the range that was asked for."""
+    """Ticks that a reader expects, and the range that was asked for, widened for the levels."""
     places = np.unique(np.concatenate([np.asarray(c.x, np.float64) for c in figure.curves]))
-    if figure.log_x:
-        axes.set_xscale("log")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        first, last = axes.get_xlim()
-        if last < 300 * first:  # powers of ten alone would be two labels or none
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    elif not figure.joined and len(places) <= 9:
+    if not figure.joined and len(places) <= 9:
         axes.set_xticks(places)
         beside = 0.06 * (places[-1] - places[0]) or 0.5  # room for dots that are moved aside
         axes.set_xlim(places[0] - beside, places[-1] + beside)
@@ -279,75 +299,73 @@ def scale(axes: Axes, figure: Figure) -> None:
         levels = [*figure.y_range, *(line.value for line in figure.references)]
         low, high = min(levels), max(levels)
         axes.set_ylim(low - 0.03 * (high - low), high + 0.03 * (high - low))
-    shorten_ticks(axes.xaxis, always=figure.log_x)
+    shorten_ticks(axes.xaxis)
     shorten_ticks(axes.yaxis)
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """How one curve is drawn. `transform`: beside the others, where runs are dots."""
+def draw_curve(
+    axes: Axes,
+    curve: Curve,
+    figure: Figure,
+    theme: Theme,
+    look: Look,
+    width: float,
+    place: Mapping[str, Any],
+) -> list[Any]:
+    """Runs, interval and, last, the mean of one curve.
 
-    color: str
-    dashes: tuple[float, ...]
-    width: float  # points
-    transform: Any
-
-    @property
-    def pattern(self) -> list[float]:
-        """The dashes in widths of this line, as long as those of any other."""
-        return [x * LINE / self.width for x in self.dashes]
-
-
-def draw_curve(axes: Axes, index: int, curve: Curve, figure: Figure, look: Drawing) -> Line2D:
-    """Runs, interval and centre of one curve, whose ids begin with `curve-index-`; the line that
-    stands for it in the legend."""
-    shown = sampled(curve, figure.centre, figure.log_x, drawn_points(figure))
-    several = sum(np.shape(other.runs)[0] for other in figure.curves) > 20
+    **Arguments:** `width`: of the line, in points; `place`: a transform for dots and bars that
+    stand beside those of other curves, {} where runs are lines.
+    """
+    shown = sampled(curve, drawn_points(figure))
+    color = theme.curves[look.color]
+    artists: list[Any] = []
+    if len(shown.runs) > 1:
+        artists = (draw_lines if figure.joined else draw_dots)(axes, shown, figure, color, place)
     few = np.isfinite(shown.centre).sum() <= FEW_POINTS
-    marker = {"marker": "o", "ms": 2.0 + look.width} if few else {}
-    artists: list[Artist] = []
-    if len(shown.runs) > 1 and figure.joined:
-        thin: dict[str, Any] = {"lw": 0.6, "alpha": 0.2 if several else 0.35, "zorder": 2}
-        artists += axes.plot(shown.x, shown.runs.T, color=look.color, **thin)
-        band: dict[str, Any] = {"color": look.color, "alpha": 0.18, "lw": 0, "zorder": 2.5}
-        artists.append(axes.fill_between(shown.x, shown.low, shown.high, **band))
-    beside = {} if figure.joined else {"transform": look.transform}
-    if len(shown.runs) > 1 and not figure.joined:
-        dots: dict[str, Any] = {"lw": 0, "marker": "o", "mew": 0, "ms": 3, "alpha": 0.45}
-        artists += axes.plot(shown.x, shown.runs.T, color=look.color, zorder=2, **dots, **beside)
-        bars = {"colors": look.color, "lw": 1.2, "zorder": 2.5}
-        artists.append(axes.vlines(shown.x, shown.low, shown.high, **bars, **beside))
-    (line,) = axes.plot(
-        *(shown.x, shown.centre),
-        **{"color": look.color, "lw": look.width, "dashes": look.pattern, "zorder": 3, **marker},
-        **({} if figure.joined else {"alpha": 0.9}),
-        **beside,
-        label=textwrap.fill(curve.label, 56),
-    )
-    for count, artist in enumerate([*artists, line]):
-        artist.set_gid(f"curve-{index}-{count}")
-    return line
+    style: dict[str, Any] = {"marker": "o", "ms": 2.0 + width} if few else {}
+    style |= {} if figure.joined else {"alpha": 0.9}
+    # Dashes are in widths of the line, and as long as those of any other.
+    dashes = [x * LINE / width for x in DASHES[look.dash]]
+    label = textwrap.fill(curve.label, 56)
+    style |= {"color": color, "lw": width, "dashes": dashes, "label": label, "zorder": 3}
+    return [*artists, *axes.plot(shown.x, shown.centre, **style, **place)]
 
 
-@dataclass(frozen=True)
-class Sampled:
-    """What is drawn of a curve: `x`, `centre`, `low`, `high` `[points]`, `runs[seeds, points]`."""
+def draw_lines(
+    axes: Axes, shown: Sampled, figure: Figure, color: str, place: Mapping[str, Any]
+) -> list[Artist]:
+    """A thin line for each run, fainter where there are many, and the band of their interval."""
+    several = sum(np.shape(other.runs)[0] for other in figure.curves) > 20
+    thin: dict[str, Any] = {"lw": 0.6, "alpha": 0.2 if several else 0.35, "zorder": 2}
+    band: dict[str, Any] = {"alpha": 0.18, "lw": 0, "zorder": 2.5}
+    return [
+        *axes.plot(shown.x, shown.runs.T, color=color, **thin, **place),
+        axes.fill_between(shown.x, shown.low, shown.high, color=color, **band, **place),
+    ]
 
-    x: Floats
-    runs: Floats
-    centre: Floats
-    low: Floats
-    high: Floats
+
+def draw_dots(
+    axes: Axes, shown: Sampled, figure: Figure, color: str, place: Mapping[str, Any]
+) -> list[Artist]:
+    """A dot for each run, and a bar for their interval."""
+    dots: dict[str, Any] = {"lw": 0, "marker": "o", "mew": 0, "ms": 3, "alpha": 0.45}
+    bars: dict[str, Any] = {"lw": 1.2, "zorder": 2.5}
+    return [
+        *axes.plot(shown.x, shown.runs.T, color=color, zorder=2, **dots, **place),
+        axes.vlines(shown.x, shown.low, shown.high, colors=color, **bars, **place),
+    ]
 
 
 def drawn_points(figure: Figure) -> int:
-    """Points per line, so that many lines do not make a heavy page."""
+    """Points per line, between 40 and `MOST_POINTS`, so that many lines do not make a heavy
+    page."""
     lines = sum(np.shape(curve.runs)[0] for curve in figure.curves)
     return int(np.clip(MOST_SEED_POINTS // lines, 40, MOST_POINTS))
 
 
 @lru_cache(maxsize=64)
-def sampled(curve: Curve, centre: str, log_x: bool, points: int) -> Sampled:
+def sampled(curve: Curve, points: int) -> Sampled:
     """At most `points` of a curve, evenly spread over the axis, the ends among them.
 
     Points are picked, not averaged: a smoothed curve would be another result.
@@ -355,39 +373,26 @@ def sampled(curve: Curve, centre: str, log_x: bool, points: int) -> Sampled:
     x = np.asarray(curve.x, dtype=np.float64)
     runs = np.asarray(curve.runs, dtype=np.float64)
     if len(x) > points:
-        spread = np.geomspace if log_x else np.linspace
-        targets = spread(x[0], x[-1], points)
-        chosen = np.unique(np.clip(np.searchsorted(x, targets), 0, len(x) - 1))
-        chosen = np.union1d(chosen, [0, len(x) - 1])
+        chosen = np.searchsorted(x, np.linspace(x[0], x[-1], points))
+        chosen = np.union1d(np.clip(chosen, 0, len(x) - 1), [0, len(x) - 1])
         x, runs = x[chosen], runs[:, chosen]
     runs = np.where(np.isfinite(runs), runs, np.nan)
-    return Sampled(x, runs, *statistics.centred(runs, centre, RESAMPLES))
+    return Sampled(x, runs, *mean(runs, RESAMPLES))
 
 
-def shorten_ticks(axis: Axis, always: bool = False) -> None:
-    """20k and 1M for 20000 and 1e6."""
-    low, high = np.sort(np.abs(axis.get_view_interval()))
-    if high >= 1e4 or (always and low >= 0.5):  # thousandths would get a unit too
+def shorten_ticks(axis: Axis) -> None:
+    """20k and 1M for 20000 and 1e6, on an axis that reaches 10,000 or more."""
+    if np.max(np.abs(axis.get_view_interval())) >= 1e4:
         axis.set_major_formatter(EngFormatter(sep=""))
 
 
-def add_legend(canvas: Canvas, handles: Sequence[Artist], theme: Theme) -> None:
-    """A legend below the axes, in as many columns as fit; the canvas grows by its height."""
-    if not handles:
-        return
+def add_legend(canvas: Canvas, handles: Sequence[Artist]) -> None:
+    """A legend below the axes, in as many columns as fit, four at most; the canvas grows by its
+    height. None without handles."""
     for most in range(min(len(handles), 4), 0, -1):
         rows = math.ceil(len(handles) / most)
         columns = math.ceil(len(handles) / rows)
-        legend = canvas.legend(
-            handles=handles,
-            ncols=columns,
-            loc="outside lower center",
-            frameon=False,
-            labelcolor=theme.ink,
-            handlelength=2.6,
-            columnspacing=1.4,
-            borderpad=0,
-        )
+        legend = canvas.legend(handles=handles, ncols=columns, loc="outside lower center")
         extent = legend.get_window_extent()
         if columns == 1 or extent.width <= 0.96 * canvas.bbox.width:
             canvas.set_figheight(canvas.get_figheight() + extent.height / canvas.dpi)
@@ -398,31 +403,17 @@ def add_legend(canvas: Canvas, handles: Sequence[Artist], theme: Theme) -> None:
 def label_references(
     canvas: Canvas, axes: Axes, references: Sequence[Reference], theme: Theme
 ) -> None:
-    """Names at the right end of the reference lines, moved apart where they would overlap."""
+    """Names at the right end of the reference lines, moved apart where they would overlap; a thin
+    line leads from each to its level. Constrained layout makes room for them."""
     lines = sorted(references, key=lambda line: line.value)
     bottom, top = axes.get_ylim()
     ends = [(line.value - bottom) / (top - bottom) for line in lines]
-    leader = {
-        "arrowstyle": "-",
-        "color": theme.muted,
-        "linewidth": 0.8,
-        "shrinkA": 0,
-        "shrinkB": 0,
-        "relpos": (0.0, 0.5),  # it ends at the left of the name, not in the middle of it
-    }
+    leader = {"arrowstyle": "-", "color": theme.muted, "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0}
+    leader["relpos"] = (0.0, 0.5)  # it ends at the left of the name, not in the middle of it
+    style: dict[str, Any] = {"va": "center", "fontsize": 9, "color": theme.muted}
+    style |= {"xycoords": "axes fraction", "annotation_clip": False, "arrowprops": leader}
     labels = [
-        axes.annotate(
-            textwrap.fill(line.label, 15),
-            xy=(1.0, end),
-            xytext=(1.05, end),
-            xycoords="axes fraction",
-            textcoords="axes fraction",
-            va="center",
-            fontsize=9,
-            color=theme.muted,
-            annotation_clip=False,
-            arrowprops=leader,
-        )
+        axes.annotate(textwrap.fill(line.label, 15), (1.0, end), (1.05, end), **style)
         for line, end in zip(lines, ends, strict=True)
     ]
     canvas.draw_without_rendering()
@@ -447,7 +438,8 @@ def spread_out(centres: Sequence[float], heights: Sequence[float]) -> list[float
 
 
 def draw_heat_map(canvas: Canvas, axes: Axes, figure: HeatMap, theme: Theme) -> None:
-    """One rectangle a cell, a bar that explains their colours, and labels."""
+    """One rectangle a cell, a bar that explains their colours, and labels. The canvas is as high as
+    the rows need: 0.2 inches each, within limits."""
     values = np.asarray(figure.values, dtype=np.float64)
     values = np.where(np.isfinite(values), values, np.nan)
     height = float(np.clip(0.65 + 0.2 * len(values), 1.65, 5.35))  # inches, of the cells
@@ -463,41 +455,36 @@ def draw_heat_map(canvas: Canvas, axes: Axes, figure: HeatMap, theme: Theme) -> 
     scale = np.linspace(low, high, 256)[:, None]
     bar.ax.imshow(scale, origin="lower", extent=(0.0, 1.0, low, high), **look)
     bar.outline.set(edgecolor=theme.grid, linewidth=0.8)  # type: ignore[operator]
-    bar.ax.tick_params(color=theme.muted, labelcolor=theme.ink, length=3)
+    bar.ax.tick_params(length=3)
     shorten_ticks(bar.ax.yaxis)
     label_cells(canvas, axes, figure, height)
 
 
 def draw_tracks(canvas: Canvas, axes: Axes, figure: Tracks, theme: Theme) -> list[Artist]:
-    """Everybody, the goals and the breaks; what stands for them in the legend."""
+    """Everybody, the goals and the breaks.
+
+    Marks in one cell stand beside and below each other, in as many columns as make them largest;
+    a faint line joins those of one track. Scripted ones are crosses of the text's colour.
+
+    **Returns:** what stands for goals and tracks in the legend.
+    """
     rows, columns = len(figure.row_labels), len(figure.column_labels)
     cell = 3.9 / columns  # inches; about what the axes have
     height = float(np.clip(rows * max(cell, 0.24), 1.3, 4.0))
     canvas.set_size_inches(WIDTH, height + 0.6)
-    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
-    axes.spines[:].set(visible=True, color=theme.grid)
-    axes.set_xticks(np.arange(0.5, columns - 1), minor=True)
-    axes.set_yticks(np.arange(0.5, rows - 1), minor=True)
-    axes.tick_params(which="minor", length=0)
-    axes.grid(which="minor", color=theme.grid, linewidth=0.7)
-    axes.set_axisbelow(True)
-    for at in figure.breaks:
-        axes.axvline(at - 0.5, color=theme.ink, linewidth=1.2, zorder=2.5)
+    draw_cells(axes, figure, theme)
     # Everybody has a place of their own in a cell: who are in one cell do not hide each other.
-    n = len(figure.tracks)
-    room = {wide: min(cell / wide, height / rows / -(-n // wide)) for wide in range(n, 0, -1)}
-    wide = max(room, key=room.__getitem__)
+    n, row = len(figure.tracks), height / rows
+    wide = max(range(n, 0, -1), key=lambda wide: min(cell / wide, row / -(-n // wide)))
     high = -(-n // wide)
-    size = min(0.8 * 72 * room[wide], 9.0)
-    handles, learners = draw_goals(axes, figure, theme), 0
+    size = min(0.8 * 72 * min(cell / wide, row / high), 9.0)
+    handles = draw_goals(axes, figure, theme)
+    colors = itertools.cycle(theme.curves[i] for i in WALKERS)
+    learners = zip(itertools.cycle(MARKERS), colors, strict=False)
     for i, track in enumerate(figure.tracks):
         x = np.arange(columns) + (i % wide + 0.5) / wide - 0.5
         y = np.asarray(track.rows) + (i // wide + 0.5) / high - 0.5
-        marker, color = "X", theme.ink
-        if not track.scripted:
-            marker = MARKERS[learners % len(MARKERS)]
-            color = theme.curves[WALKERS[learners % len(WALKERS)]]
-            learners += 1
+        marker, color = ("X", theme.ink) if track.scripted else next(learners)
         look: dict[str, Any] = {"marker": marker, "color": color, "mec": theme.page}
         axes.plot(x, y, **look, lw=0.8, alpha=0.3, ms=0, zorder=3)
         axes.plot(x, y, **look, lw=0, ms=size, mew=0.12 * size, zorder=4)
@@ -505,6 +492,19 @@ def draw_tracks(canvas: Canvas, axes: Axes, figure: Tracks, theme: Theme) -> lis
         handles.append(Line2D([], [], **look, lw=0, ms=7, mew=0.7, label=label))
     label_cells(canvas, axes, figure, height)
     return handles
+
+
+def draw_cells(axes: Axes, figure: Tracks, theme: Theme) -> None:
+    """The grid of tracks, row 0 at the top, and a line at each break."""
+    rows, columns = len(figure.row_labels), len(figure.column_labels)
+    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
+    axes.spines[:].set(visible=True, color=theme.grid)
+    axes.set_xticks(np.arange(0.5, columns - 1), minor=True)
+    axes.set_yticks(np.arange(0.5, rows - 1), minor=True)
+    axes.tick_params(which="minor", length=0)
+    axes.grid(which="minor")
+    for at in figure.breaks:
+        axes.axvline(at - 0.5, color=theme.ink, linewidth=1.2, zorder=2.5)
 
 
 def draw_goals(axes: Axes, figure: Tracks, theme: Theme) -> list[Artist]:
@@ -530,7 +530,11 @@ def draw_goals(axes: Axes, figure: Tracks, theme: Theme) -> list[Artist]:
 
 
 def color_scale(values: Floats, theme: Theme) -> tuple[Colormap, float, float]:
-    """From the page's own colour to a strong one; values of both signs meet at zero."""
+    """Colours of a heat map, and the values of the first and the last one.
+
+    From the page's own colour to a strong one; values of both signs meet at zero, where the page's
+    colour is. NaN is grey. Where all values are one, the scale is one wide.
+    """
     present = values[~np.isnan(values)]
     low, high = (present.min(), present.max()) if present.size else (0.0, 1.0)
     stops = [theme.page, theme.cold]
@@ -546,13 +550,11 @@ def color_scale(values: Floats, theme: Theme) -> tuple[Colormap, float, float]:
 
 
 def label_cells(canvas: Canvas, axes: Axes, figure: HeatMap | Tracks, height: float) -> None:
-    """As many row and column labels as are readable: all, turned, or every n-th."""
+    """As many row and column labels as are readable: all, turned, or every n-th. `height`: of all
+    rows, in inches. The canvas grows where labels are turned."""
     rows, columns = len(figure.row_labels), len(figure.column_labels)
     every = nice_step(rows * 0.17 / height)
-    axes.set_yticks(
-        range(0, rows, every),
-        [shortened(label) for label in figure.row_labels[::every]],
-    )
+    axes.set_yticks(range(0, rows, every), [shortened(x) for x in figure.row_labels[::every]])
     labels = [shortened(label) for label in figure.column_labels]
     cell = 3.4 * 72 / columns  # points; 3.4 inches are about what the axes have
     needed = 5.5 * max(map(len, labels)) + 6
@@ -565,16 +567,13 @@ def label_cells(canvas: Canvas, axes: Axes, figure: HeatMap | Tracks, height: fl
             label.set(rotation=90, rotation_mode="anchor", ha="right", va="center")
 
 
-def shortened(label: object, most: int = 24) -> str:
+def shortened(label: object) -> str:
+    """A label of at most 24 characters."""
     text = str(label)
-    return text if len(text) <= most else f"{text[: most - 1].rstrip()}…"
+    return text if len(text) <= 24 else f"{text[:23].rstrip()}…"
 
 
 def nice_step(least: float) -> int:
     """The first of 1, 2, 5, 10, 20, 50, … that is `least` or more."""
-    size = 1
-    while True:
-        for step in (size, 2 * size, 5 * size):
-            if step >= least:
-                return step
-        size *= 10
+    steps = (step * 10**power for power in itertools.count() for step in (1, 2, 5))
+    return next(step for step in steps if step >= least)

@@ -56,10 +56,8 @@ def rows(metric: str, values: ArrayLike, labels: Labels | None = None, **axes: A
 
     `rows("return", returns, seed=[0, 1, 2], episode=None)` of `returns[3, 10]` is 30 rows.
     """
-    return [
-        Row(found, seed, metric, value)
-        for found, seed, value in _entries(metric, np.asarray(values, object), labels, axes)
-    ]
+    array = np.asarray(values, object)
+    return [Row(x, seed, metric, value) for x, seed, value in _entries(metric, array, labels, axes)]
 
 
 def series(
@@ -67,39 +65,36 @@ def series(
 ) -> list[Series]:
     """An array `[…, points]` as one series for each entry of its other dimensions, which `axes`
     names as in `rows`."""
-    places: list[float] = plain(at)
-    array = np.asarray(values, object)
-    flat = np.empty(array.shape[:-1], object)
-    for index in np.ndindex(flat.shape):
-        flat[index] = list(array[index])
-    return [
-        Series(found, seed, metric, x, places, plain(points))
-        for found, seed, points in _entries(metric, flat, labels, axes)
-    ]
+    array, places = np.asarray(values, object), plain(at)
+    entries = _entries(metric, array, labels, axes, points=1)
+    return [Series(found, seed, metric, x, places, values) for found, seed, values in entries]
 
 
 def _entries(
-    metric: str, array: np.ndarray, labels: Labels | None, axes: Mapping[str, Any]
+    metric: str, array: np.ndarray, labels: Labels | None, axes: Mapping[str, Any], points: int = 0
 ) -> Iterator[tuple[dict[str, Label], int | None, Any]]:
+    """Labels, seed and value of each entry of an array; the last `points` dimensions are no axes.
+    Raises `ValueError` if `axes` do not fit the others."""
+    shape = array.shape[: array.ndim - points]
     names = [
         list(range(size)) if given is None else list(given)
-        for size, given in zip(array.shape, axes.values(), strict=False)
+        for size, given in zip(shape, axes.values(), strict=False)
     ]
-    if [len(given) for given in names] != list(array.shape) or len(axes) != array.ndim:
+    if tuple(map(len, names)) != shape or len(axes) != len(shape):
         raise ValueError(
-            f"{metric!r} has shape {array.shape} and axes "
+            f"{metric!r} has shape {shape} and axes "
             f"{ {name: len(given) for name, given in zip(axes, names, strict=False)} }: name every "
             "dimension, with one label for each entry"
         )
-    for index, found in zip(np.ndindex(array.shape), product(*names), strict=True):
-        told = dict(zip(axes, found, strict=True))
+    for index, found in zip(np.ndindex(shape), product(*names), strict=True):
+        told = {**(labels or {}), **dict(zip(axes, found, strict=True))}
         seed = told.pop("seed", None)
-        value = array[index]
-        yield {**(labels or {}), **told}, seed, value if isinstance(value, list) else plain(value)
+        yield told, seed, plain(array[index])
 
 
 def plain(value: Any) -> Any:
-    """NumPy and JAX numbers, and lists of them, as Python's; what is not finite is None."""
+    """NumPy and JAX numbers, and lists and mappings of them, as Python's, so that JSON can hold
+    them; what is not finite is None. Text stays text."""
     if isinstance(value, Mapping):
         return {str(key): plain(x) for key, x in value.items()}
     if isinstance(value, str) or value is None:
@@ -130,6 +125,7 @@ class Results:
         out; `name=None` asks for rows that do not have it."""
 
         def fits(found: Labels) -> bool:
+            """Whether these labels are the wanted ones."""
             return all(
                 found.get(name) in wanted
                 if isinstance(wanted, tuple | list | set | frozenset)
@@ -153,10 +149,6 @@ class Results:
         there = dict.fromkeys(values for values in found if None not in values)
         return [values[0] for values in there] if len(labels) == 1 else list(there)
 
-    def metrics(self) -> list[str]:
-        """Names of the metrics, in order of appearance."""
-        return list(dict.fromkeys(item.metric for item in [*self.rows, *self.curves]))
-
     def by_seed(self, metric: str, **labels: Any) -> dict[int | None, list[Any]]:
         """Values of a metric by seed, in the order of the rows."""
         found: dict[int | None, list[Any]] = {}
@@ -176,22 +168,21 @@ class Results:
     def array(self, metric: str, *dims: str, **labels: Any) -> np.ndarray:
         """Values of a metric as an array whose dimensions are these labels (`seed` among them),
         in order of appearance; None where there is no such row. For series, the last dimension is
-        their points and need not be named."""
+        their points and need not be named. Raises `ValueError` if series differ in length."""
         chosen = self.where(**labels)
-        items = [x for x in [*chosen.rows, *chosen.curves] if x.metric == metric]
-
-        def place(item: Row | Series) -> tuple[Any, ...]:
-            told = {**item.labels, "seed": item.seed}
-            return tuple(told.get(name) for name in dims)
-
-        levels = [list(dict.fromkeys(key)) for key in zip(*map(place, items), strict=True)]
-        points = {len(item.values) for item in items if isinstance(item, Series)}
+        found = [(x, x.value) for x in chosen.rows] + [(x, x.values) for x in chosen.curves]
+        values = {
+            tuple({**x.labels, "seed": x.seed}.get(name) for name in dims): value
+            for x, value in found
+            if x.metric == metric
+        }
+        levels = [list(dict.fromkeys(places)) for places in zip(*values, strict=True)]
+        points = {len(value) for value in values.values() if np.ndim(value)}
         if len(points) > 1:
             raise ValueError(f"{metric!r} has series of {sorted(points)} points: ask for fewer")
         array = np.full([*map(len, levels), *points], None, object)
-        for item in items:
-            where = tuple(level.index(x) for level, x in zip(levels, place(item), strict=True))
-            array[where] = item.values if isinstance(item, Series) else item.value
+        for place, value in values.items():
+            array[tuple(level.index(x) for level, x in zip(levels, place, strict=True))] = value
         return array
 
 
@@ -199,7 +190,11 @@ class Results:
 
 
 def write(results: Results, path: str | os.PathLike[str]) -> None:
-    """Write `results.json`, one line per row and curve, so that a diff can be read."""
+    """Write `results.json`, one line per row and curve, so that a diff can be read.
+
+    Runs of one curve (the same labels, metric and places) are one line, by seed. The columns of the
+    rows are all labels that any row has, in order of appearance. A reader never sees half a file.
+    """
     names = list(dict.fromkeys(name for row in results.rows for name in row.labels))
     curves: dict[str, dict[str, Any]] = {}
     for curve in results.curves:
@@ -222,6 +217,7 @@ def write(results: Results, path: str | os.PathLike[str]) -> None:
 
 
 def _block(value: str | list[str]) -> str:
+    """JSON of a field, of a list one line per entry."""
     return value if isinstance(value, str) else "[\n" + ",\n".join(value) + "\n]"
 
 
@@ -231,32 +227,23 @@ def read(path: str | os.PathLike[str]) -> Results:
         record = json.loads(files.read_text(Path(path)))
         names = record["columns"][:-3]
         found = [
-            Row(
-                {k: v for k, v in zip(names, row, strict=False) if v is not None},
-                *row[-3:],
-            )
+            Row({k: v for k, v in zip(names, row, strict=False) if v is not None}, *row[-3:])
             for row in record["rows"]
         ]
         curves = [
-            Series(
-                curve["labels"],
-                None if seed == "None" else int(seed),
-                curve["metric"],
-                curve["x"],
-                curve["at"],
-                values,
-            )
+            Series(seed=None if seed == "None" else int(seed), values=values, **curve)
             for curve in record["curves"]
-            for seed, values in curve["seeds"].items()
+            for seed, values in curve.pop("seeds").items()
         ]
         head = {name: record[name] for name in ("experiment", "budget", "command", "cells")}
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is no record of results ({error!r})") from error
     return Results(**head, rows=found, curves=curves)
 
 
 def concat(parts: Iterable[Iterable[Row | Series]]) -> tuple[list[Row], list[Series]]:
-    """Rows and series of several measurements, each kind together."""
+    """Rows and series of several measurements, each kind together and in order: what a measure of
+    an experiment yields mixes both."""
     every = [item for part in parts for item in part]
     found = [item for item in every if isinstance(item, Row)]
     return found, [item for item in every if isinstance(item, Series)]

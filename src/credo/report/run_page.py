@@ -7,20 +7,18 @@ imported but Credo's own. So a page about a stranger's run needs no trust in the
 import json
 import pathlib
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..algorithms.lineage import MAKERS
-from ..analysis import attribution, floors
-from ..environments.base import AbstractSequenceTask
-from ..environments.sequence_classification import SequenceClassification
-from ..environments.sequence_recall import SequenceRecall
+from ..analysis import attribution, bounds
 from ..learners.base import AbstractLearner
 from ..runs import config
 from ..runs.record import RunError
 from ..runs.store import Run
+from .figures import shortened
 from .pages import write as write_page
 from .sections import Cell, Curve, Figure, Page, Reference, Section, Summary, Table
 
@@ -49,27 +47,24 @@ def write(
             raise RunError(f"{path} has no generation yet: wait for its first, or resume it")
         groups.setdefault(json.dumps(run.config["algorithm"]), []).append(run)
     names = group_labels([json.loads(key) for key in groups])
-    if labels is not None:
-        if len(set(labels)) != len(labels) or len(labels) != len(names):
-            raise RunError(
-                f"{len(set(labels))} different labels are given for {len(names)} curves: give one "
-                f"for each of {'; '.join(names)}"
-            )
-        names = list(labels)
-    runs = dict(zip(names, groups.values(), strict=True))
-    target.parent.mkdir(parents=True, exist_ok=True)
-    write_page(describe(runs, paths), target)
-    return target
+    given = names if labels is None else labels
+    if len(set(given)) != len(names) or len(given) != len(names):
+        raise RunError(
+            f"{len(set(given))} different labels are given for {len(names)} curves: give one "
+            f"for each of {'; '.join(names)}"
+        )
+    return write_page(describe(dict(zip(given, groups.values(), strict=True)), paths), target)
 
 
 def describe(runs: Groups, paths: Sequence[pathlib.Path]) -> Page:
-    """The page about runs."""
-    first = paths[0].name if len(paths) == 1 else f"{len(paths)} runs"
-    every = [run for group in runs.values() for run in group]
-    machines = [run.config["machine"] for run in every]
+    """The page about runs `paths`: scores, what each algorithm improves, attribution, settings, and
+    where they were made. `runs`: those that differ in their seed alone, by label."""
+    every = [run.config for group in runs.values() for run in group]
+    machines = [config["machine"] for config in every]
+    versions = (", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines)
     return Page(
-        title=f"Credo: {first}",
-        lead=_lead(every),
+        title=f"Credo: {paths[0].name if len(paths) == 1 else f'{len(paths)} runs'}",
+        lead=f"Task: {'; '.join(sorted({_task(c['algorithm']['env']) for c in every}))}.",
         command="credo report " + shlex.join(map(str, paths)),
         sections=[
             _figure(runs, "champion_score", "Best policy on fresh episodes, as last tested"),
@@ -86,23 +81,19 @@ def describe(runs: Groups, paths: Sequence[pathlib.Path]) -> Page:
             "machine": _once(
                 f"{m['processor']}, {m['cores']} cores, {m['system']}" for m in machines
             ),
-            "versions": _once(
-                ", ".join(f"{k} {v}" for k, v in m["versions"].items()) for m in machines
-            ),
+            "versions": _once(versions),
         },
     )
 
 
 def _once(texts: Iterable[str]) -> list[str]:
+    """Texts without repetitions, in order of appearance."""
     return list(dict.fromkeys(texts))
 
 
-def _lead(runs: Sequence[Run]) -> str:
-    tasks = {
-        str(tree["id"]) if "id" in tree else config.brief(tree)
-        for tree in (run.config["algorithm"]["env"] for run in runs)
-    }
-    return f"Task: {'; '.join(sorted(tasks))}."
+def _task(tree: Tree) -> str:
+    """The id of a task of Gymnasium or PettingZoo; of ours its class and fields."""
+    return str(tree["id"]) if "id" in tree else config.brief(dict(tree))
 
 
 # ------------------------------------------------------------------------------------------- labels
@@ -131,6 +122,7 @@ def _learner_word(learner: Tree) -> str:
 
 
 def _class(tree: Tree) -> str:
+    """The class of a record without its module."""
     return tree["class"].partition(":")[2]
 
 
@@ -139,19 +131,17 @@ def group_labels(trees: Sequence[Tree]) -> list[str]:
     in which these differ."""
     words = [word(tree) for tree in trees]
     flat = [config.flatten(_indexed(tree)) for tree in trees]
-    labels = list(words)
-    for name in dict.fromkeys(words):
-        same = [i for i, other in enumerate(words) if other == name]
-        if len(same) > 1:
-            fields = telling([flat[i] for i in same])
-            for i in same:
-                told = [f"{_short(key, fields)} {_text(flat[i].get(key))}" for key in fields]
-                labels[i] = f"{name}: {', '.join(told)}"
+    labels = []
+    for name, tree in zip(words, flat, strict=True):
+        fields = telling([x for x, other in zip(flat, words, strict=True) if other == name])
+        told = ", ".join(f"{_short(key, fields)} {_text(tree.get(key))}" for key in fields)
+        labels.append(f"{name}: {told}" if told else name)
     return numbered(labels)
 
 
 def telling(flat: Sequence[Mapping[str, Any]]) -> list[str]:
-    """At most three fields by which settings can be told apart, or nearly so."""
+    """At most three fields by which settings can be told apart, or nearly so: again and again the
+    field that tells most of them apart, given those that were chosen before."""
 
     def kinds(fields: Sequence[str]) -> int:
         return len({tuple(str(tree.get(key)) for key in fields) for tree in flat})
@@ -184,9 +174,9 @@ def _short(key: str, others: Sequence[str]) -> str:
     return last if alone and not last.isdigit() else key
 
 
-def _text(value: Any, most: int = 24) -> str:
-    text = "none" if value is None else str(value)
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+def _text(value: Any) -> str:
+    """A setting in words, at most 24 characters."""
+    return "none" if value is None else shortened(value)
 
 
 def _indexed(tree: Any) -> Any:
@@ -203,33 +193,37 @@ def _indexed(tree: Any) -> Any:
 
 
 def _improved(runs: Groups) -> list[Figure]:
-    """What each algorithm improves: fitness, or a loss."""
+    """What each algorithm improves: fitness, or a loss, where all of its runs have recorded it. One
+    figure for each of the two that any algorithm has."""
     titles = {"fitness_max": "Best fitness of each generation", "loss": "Loss of each generation"}
-    found = []
-    for metric, title in titles.items():
-        known = {
-            label: group
-            for label, group in runs.items()
-            if all(metric in run.metrics for run in group)
-            and (metric == "fitness_max" or "fitness_max" not in group[0].metrics)
-        }
-        found += [_figure(known, metric, title)] if known else []
-    return found
+    improves = {
+        label: next((x for x in titles if all(x in run.metrics for run in group)), None)
+        for label, group in runs.items()
+    }
+    return [
+        _figure({x: runs[x] for x in runs if improves[x] == metric}, metric, title)
+        for metric, title in titles.items()
+        if metric in improves.values()
+    ]
 
 
 def _figure(runs: Groups, metric: str, title: str) -> Figure:
+    """A metric of every algorithm over frames, or over generations where no run counts frames."""
     budgets = [run.config.get("budget", {}) for group in runs.values() for run in group]
     unit = "frames" if all(budget.get("frames") for budget in budgets) else "generation"
     curves = [_curve(label, group, metric, unit) for label, group in runs.items()]
-    known = [_bounds(group[0]) for group in runs.values()] if metric == "champion_score" else []
-    levels = dict.fromkeys(level for pair in known if pair for level in pair)
+    scores = metric == "champion_score"
+    levels = dict.fromkeys(x for group in runs.values() if scores for x in _bounds(group) or ())
     names = {"champion_score": "success" if levels else "return", "fitness_max": "fitness"}
     return Figure(title, unit, names.get(metric, metric), curves, tuple(levels))
 
 
 def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
-    """One metric of runs that differ in their seed, as far as all of them are. Over frames they
-    have rows at places of their own: each keeps its value until its next row."""
+    """One metric of runs that differ in their seed, as far as all of them are.
+
+    Over frames, runs have rows at places of their own: each keeps its value until its next row, and
+    the curve has points at up to 240 places that they share, from where all have begun.
+    """
     columns = [run.metrics for run in group]
     if unit == "generation":
         length = min(len(c[unit]) for c in columns)
@@ -240,103 +234,96 @@ def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
     return Curve(label, grid, [attribution.on_grid(c[unit], c[metric], grid) for c in columns])
 
 
-def _bounds(run: Run) -> tuple[Reference, Reference] | None:
-    """The best trivial policy and the upper bound of a run's task, where Credo may know them. No
-    other task is made: that might run somebody's code."""
-    recorded = run.config["algorithm"]["env"]
-    ours = map(config.class_name, (SequenceClassification, SequenceRecall))
-    task: AbstractSequenceTask | None = (
-        config.from_tree(recorded) if recorded["class"] in ours else None
-    )
-    if task is None or not floors.known(task):
+def _bounds(group: list[Run]) -> tuple[Reference, Reference] | None:
+    """The best baseline and the upper bound of a run's task, where they are known exactly. No
+    other task is made: that might run code of others."""
+    recorded = group[0].config["algorithm"]["env"]
+    if recorded["class"] not in map(config.class_name, bounds.EXACT):
         return None
-    name, value = floors.floor(task)
-    return Reference(f"baseline: {name}", value), Reference("upper bound", floors.CEILING)
+    task = config.from_tree(recorded)
+    if not bounds.exact(task):
+        return None
+    name, value = bounds.best_baseline(task)
+    highest = bounds.upper_bound(task).value
+    return Reference(f"baseline: {name}", value), Reference("upper bound", highest)
 
 
 def _table(runs: Groups) -> Table:
-    known = [_bounds(group[0]) for group in runs.values()]
-    rows = []
-    for (label, group), bounds in zip(runs.items(), known, strict=True):
-        scores = [float(run.metrics["champion_score"][-1]) for run in group]
-        score = Summary(scores, [run.config["seed"] for run in group])
-        last = min(int(run.metrics["generation"][-1]) for run in group)
-        told: list[Cell] = [None, None]
-        if bounds is not None:
-            low, high = bounds
-            told = [f"{low.value:.3f} ({low.label.partition(': ')[2]})", high.value]
-        rows.append([label, score, *(told if any(known) else ()), len(group), last])
-    beside = ["baseline", "upper bound"] if any(known) else []
-    caption = f"On {_episodes(runs)} fresh episodes; `credo evaluate` plays more."
-    return Table(
-        "Score of the best policy, as last tested",
-        ["algorithm", "best policy", *beside, "seeds", "generations"],
-        rows,
-        caption + ("" if beside else " No baseline and no upper bound of this task are known."),
-    )
+    """The last test of every algorithm, beside baseline and upper bound where one has them."""
+    columns = ["algorithm", "best policy", "baseline", "upper bound", "seeds", "generations"]
+    rows = [_row(label, group) for label, group in runs.items()]
+    each = sorted({group[0].config["algorithm"]["test_episodes"] for group in runs.values()})
+    episodes = " or ".join(map(str, each))
+    caption = f"On {episodes} fresh episodes; `credo evaluate` plays more."
+    if not any(row[2] for row in rows):
+        columns, rows = columns[:2] + columns[4:], [row[:2] + row[4:] for row in rows]
+        caption += " No baseline and no upper bound of this task are known."
+    return Table("Score of the best policy, as last tested", columns, rows, caption)
 
 
-def _episodes(runs: Groups) -> str:
-    each = [group[0].config["algorithm"]["test_episodes"] for group in runs.values()]
-    return " or ".join(str(n) for n in sorted(set(each)))
+def _row(label: str, group: list[Run]) -> list[Cell]:
+    """An algorithm in the table: the last score of each seed, the bounds of its task (None where
+    they are not known), seeds, and the generations that all runs have."""
+    scores = [float(run.metrics["champion_score"][-1]) for run in group]
+    told: list[Cell] = [None, None]
+    if limits := _bounds(group):
+        low, high = limits
+        told = [f"{low.value:.3f} ({low.label.partition(': ')[2]})", high.value]
+    last = min(int(run.metrics["generation"][-1]) for run in group)
+    summary = Summary(scores, [run.config["seed"] for run in group])
+    return [label, summary, *told, len(group), last]
 
 
 # -------------------------------------------------------------------------------------- attribution
 
 
-def _attributions(runs: Groups) -> list[Section]:
-    sections: list[Section] = []
+def _attributions(runs: Groups) -> Iterator[Section]:
+    """Of algorithms that recorded it, who changed the best policy last; with learners also where
+    its weights come from, who had the workers, and what became of the learners' actors."""
     for label, group in runs.items():
         metrics = [run.metrics for run in group]
-        if all(map(attribution.known, metrics)):
-            names = learner_names(group[0].config["algorithm"].get("learners", ()))
-            title = f"{label}: " if len(runs) > 1 else ""
-            sections += attributed(attribution.summary(metrics), names, title)
-    return sections
+        if not all(map(attribution.known, metrics)):
+            continue
+        found = attribution.summary(metrics)
+        learners = learner_names(group[0].config["algorithm"].get("learners", ()))
+        title = f"{label}: " if len(runs) > 1 else ""
+        share = "share of best policies, mean of a tenth of the run"
+        last = f"{title}Who was the last to change the best policy"
+        yield _shares(last, share, found, "makers", MAKERS)
+        if learners:
+            ancestors = [*learners, "first draw"]  # a learner has one colour in both figures
+            origin = f"{title}Where the best policy's weights come from"
+            yield _shares(origin, "expected share", found, "ancestry", ancestors)
+        if len(learners) > 1:
+            workers = f"{title}Workers of each learner so far"
+            yield _shares(workers, "share of all workers", found, "allocation", learners)
+        if learners:
+            yield _fates(found, learners, title)
 
 
-def attributed(found: Mapping[str, Any], learners: list[str], title: str = "") -> list[Section]:
-    """What `attribution.summary` found as figures and a table. `title`: put before each title."""
-    made = np.array(found["makers"], np.float64)  # [runs, makers, points]
-    present = [i for i in range(len(MAKERS)) if np.nanmax(made[:, i], initial=0.0) > 0]
-    sections: list[Section] = [
-        Figure(
-            f"{title}Who was the last to change the best policy",
-            "frames",
-            "share of best policies, mean of a tenth of the run",
-            [Curve(MAKERS[i], found["frames"], made[:, i]) for i in present],
-            y_range=(0.0, 1.0),
-        )
+def _shares(
+    title: str, unit: str, found: Mapping[str, Any], key: str, labels: Sequence[str]
+) -> Figure:
+    """Shares `[runs, labels, points]` of `attribution.summary` over frames. Who never made a best
+    policy has no curve."""
+    values = np.array(found[key], np.float64)
+    curves = [
+        Curve(label, found["frames"], values[:, i])
+        for i, label in enumerate(labels)
+        if key != "makers" or np.nanmax(values[:, i], initial=0.0) > 0
     ]
-    if not learners:
-        return sections
-    ancestors = [*learners, "first draw"]  # a learner has one colour in both figures
-    over_time = {
-        "Where the best policy's weights come from": ("ancestry", ancestors, "expected share"),
-        "Workers of each learner so far": ("allocation", learners, "share of all workers"),
-    }
-    for name, (key, labels, unit) in over_time.items():
-        if len(labels) > 1:
-            values = np.array(found[key], np.float64)  # [runs, labels, points]
-            curves = [Curve(x, found["frames"], values[:, i]) for i, x in enumerate(labels)]
-            sections.append(Figure(title + name, "frames", unit, curves, y_range=(0.0, 1.0)))
-    return [*sections, fates(found, learners, title)]
+    return Figure(title, "frames", unit, curves, y_range=(0.0, 1.0))
 
 
-def fates(found: Mapping[str, Any], learners: list[str], title: str = "") -> Table:
+def _fates(found: Mapping[str, Any], learners: list[str], title: str) -> Table:
     """Allocation, and the fate of injected actors, in percent."""
     shares = np.array(found["fates"], np.float64)  # [runs, q, 3]
-    allocated = np.array(found["allocated"], np.float64)
-    injected = np.array(found["injected"])
-    rows = [
-        [
-            name,
-            percent(allocated[:, i]),
-            int(injected[:, i].sum()),
-            *(percent(shares[:, i, j]) for j in range(len(attribution.FATES))),
-        ]
-        for i, name in enumerate(learners)
-    ]
+    shares = np.concatenate([np.array(found["allocated"], np.float64)[..., None], shares], axis=2)
+    injected = np.sum(found["injected"], axis=0)
+    rows: list[list[Cell]] = []
+    for i, name in enumerate(learners):
+        workers, *fates = (Summary(list(x), scale=100.0, digits=1) for x in shares[:, i].T)
+        rows.append([name, workers, int(injected[i]), *fates])
     return Table(
         f"{title}Learners: their workers, and the fate of their actors in the population",
         ["learner", "workers, %", "injected", *(f"{fate}, %" for fate in attribution.FATES)],
@@ -344,12 +331,6 @@ def fates(found: Mapping[str, Any], learners: list[str], title: str = "") -> Tab
         caption="Injected: actors that were judged, in all runs together; the last ones may not "
         "have been. Selected: a parent, but no elite.",
     )
-
-
-def percent(shares: np.ndarray) -> Summary:
-    """Shares `[runs]` in percent."""
-    values = [float(x) if np.isfinite(x) else None for x in shares]
-    return Summary(values, scale=100.0, digits=1)
 
 
 def learner_names(learners: Sequence[AbstractLearner | Tree]) -> list[str]:
@@ -370,17 +351,19 @@ def learner_names(learners: Sequence[AbstractLearner | Tree]) -> list[str]:
 def _settings(runs: Groups) -> list[Table]:
     """Settings that several algorithms have and that differ; and all, where those are marked."""
     flat = [config.flatten(_indexed(group[0].config["algorithm"])) for group in runs.values()]
-    keys = list(dict.fromkeys(key for tree in flat for key in tree))
-    unlike = {key for key in differing(flat) if sum(key in tree for tree in flat) > 1}
-    rows = {key: [key, *(_text(tree[key]) if key in tree else "" for tree in flat)] for key in keys}
+    unlike = [key for key in differing(flat) if sum(key in tree for tree in flat) > 1]
     columns = ["setting", *runs]
+    rows = {
+        key: [key, *(_text(tree[key]) if key in tree else "" for tree in flat)]
+        for key in dict.fromkeys(key for tree in flat for key in tree)
+    }
     every = Table(
         "All settings",
         columns,
         list(rows.values()),
         caption="Marked: settings that differ." if unlike else "",
-        marked=[i for i, key in enumerate(keys) if key in unlike],
+        marked=[i for i, key in enumerate(rows) if key in unlike],
         folded=True,
     )
-    few = Table("Settings that differ", columns, [rows[key] for key in keys if key in unlike])
+    few = Table("Settings that differ", columns, [rows[key] for key in unlike])
     return [few, every] if unlike else [every]

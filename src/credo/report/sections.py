@@ -7,7 +7,6 @@ records is cheap: it loads neither.
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,8 +14,8 @@ from numpy.typing import ArrayLike
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """Independent runs in one cell of a table: shown as their mean (or interquartile mean) with a
-    95 % bootstrap interval, and every run.
+    """Independent runs in one cell of a table: shown as their mean with a 95 % bootstrap interval,
+    and every run.
 
     `values`: one per seed, in the order of `seeds`; None where a run has none. `scale`: what they
     are multiplied with, 100 for percent. `digits`: behind the point; None: three or four in all.
@@ -26,7 +25,6 @@ class Summary:
     seeds: Sequence[int] = ()
     scale: float = 1.0
     digits: int | None = None
-    centre: Literal["mean", "iqm"] = "mean"
 
     def __post_init__(self):
         if len(self.seeds) not in (0, len(self.values)):
@@ -76,7 +74,7 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """Curves over a common axis, with the interval of their centre and every seed.
+    """Curves over a common axis, with the mean over seeds, its interval and every seed.
 
     `joined`: whether a run goes on from one x to the next. Over depth, coupling or another setting
     each x has runs of its own, which are drawn as dots.
@@ -88,20 +86,14 @@ class Figure:
     curves: Sequence[Curve]
     references: Sequence[Reference] = ()
     caption: str = ""
-    log_x: bool = False
     y_range: tuple[float, float] | None = None  # (low, high); widened to show the references
-    centre: Literal["mean", "median", "iqm"] = "mean"  # the thick line
     joined: bool = True
 
     def __post_init__(self):
         if not self.curves:
             raise ValueError(f"figure {self.title!r} has no curves: give at least one")
-        if self.log_x and any(np.min(curve.x) <= 0 for curve in self.curves):
-            raise ValueError(f"figure {self.title!r} has log_x, but an x that is not positive")
         if self.y_range is not None and not self.y_range[0] < self.y_range[1]:
             raise ValueError(f"figure {self.title!r} has y_range {self.y_range}: give (low, high)")
-        if self.centre not in ("mean", "median", "iqm"):
-            raise ValueError(f"centre is {self.centre!r}: it must be 'mean', 'median' or 'iqm'")
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +120,8 @@ class HeatMap:
 
 @dataclass(frozen=True)
 class Track:
-    """Somebody's row at each column of `Tracks`. `notes`: what the table adds at each column."""
+    """A row at each column of `Tracks`. `notes`: what the table adds at each column, "" where there
+    is nothing to add; none at all if there is nothing anywhere."""
 
     label: str
     rows: Sequence[int]
@@ -169,7 +162,7 @@ class Tracks:
         for place in every[1:]:
             if not all(0 <= row < rows for row in place):
                 raise ValueError(
-                    f"tracks {self.title!r} have {rows} row labels and somebody or a goal in rows "
+                    f"tracks {self.title!r} have {rows} row labels and a mark or a goal in rows "
                     f"{list(place)}: each must be in 0..{rows - 1}"
                 )
 
@@ -178,6 +171,7 @@ class Tracks:
         """The same in words, a row for each column of the picture."""
 
         def note(track: Track, column: int) -> list[str]:
+            """What is added to a place, if anything."""
             return [x for x in track.notes[column : column + 1] if x]
 
         notes = [self.outcomes[0 if reached else 1] for reached in self.reached]
@@ -191,7 +185,8 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A picture of its own: one `<svg>` element for each colouring, whose ids differ."""
+    """A picture of its own: one `<svg>` element for each colouring. Ids must differ, also from
+    those of other drawings on the page (see the `prefix` of `trajectories`)."""
 
     title: str
     light: str
@@ -226,6 +221,8 @@ class Table:
 
 @dataclass(frozen=True)
 class Text:
+    """Paragraphs; what stands between backticks is code."""
+
     title: str
     paragraphs: Sequence[str]
 
@@ -236,9 +233,13 @@ Section = Drawn | Table | Text
 
 @dataclass(frozen=True)
 class Page:
-    """`command` is what makes the page, exactly as typed; `facts` say where its numbers come
-    from: versions, processor, seeds; each is one value or several. `banner`: what a reader must
-    know before anything else, such as `SMOKE`."""
+    """A page of results.
+
+    `lead`: a sentence or two below the title. `command`: what makes the page, exactly as typed.
+    `sections`: in order; neighbouring figures stand together. `facts`: where its numbers come from
+    (versions, processor, seeds); each is one value or several. `banner`: what a reader must know
+    before anything else, such as `SMOKE`. Lead and captions are prose: `code` between backticks.
+    """
 
     title: str
     lead: str

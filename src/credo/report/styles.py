@@ -10,9 +10,6 @@ from typing import Any, NamedTuple
 import matplotlib
 
 STATIC = Path(__file__).parent / "static"
-STYLE: dict[Any, Any] = dict(
-    matplotlib.rc_params_from_file(STATIC / "figure.mplstyle", use_default_template=False)
-)
 
 
 @dataclass(frozen=True)
@@ -28,6 +25,21 @@ class Theme:
     cold: str  # lowest value of a heat map with both signs
     warm: str  # highest value
     curves: tuple[str, ...]
+
+    @property
+    def rc(self) -> dict[Any, Any]:
+        """Settings of matplotlib: those of all figures, in these colours."""
+        file = STATIC / "figure.mplstyle"
+        colors = {
+            "axes.edgecolor": self.muted,
+            "axes.labelcolor": self.ink,
+            "axes.titlecolor": self.ink,
+            "grid.color": self.grid,
+            "legend.labelcolor": self.ink,
+        }
+        colors |= {f"{axis}tick.color": self.muted for axis in "xy"}
+        colors |= {f"{axis}tick.labelcolor": self.ink for axis in "xy"}
+        return dict(matplotlib.rc_params_from_file(file, use_default_template=False)) | colors
 
 
 LIGHT = Theme(
@@ -54,7 +66,8 @@ DASHES = ((1.0, 0.0), (6.0, 1.6), (6.0, 1.5, 1.3, 1.5), (1.3, 1.3))  # in widths
 
 
 class Look(NamedTuple):
-    """Indices of a colour among a theme's `curves`, and of `DASHES`."""
+    """How a curve looks in every theme: indices of a colour among a theme's `curves`, and of
+    `DASHES`."""
 
     color: int
     dash: int
@@ -73,14 +86,19 @@ ALIASES = {"gradient": "bptt", "evolution": "neuroevolution", "ff": "mlp", "feed
 
 
 def method(label: str) -> str | None:
-    """The first known method that a label names, in any spelling of case."""
+    """The first known method that a label names, in any spelling of case: "erl" of "ERL: 10
+    policies". None if there is none."""
     words = (ALIASES.get(word, word) for word in re.findall(r"\w+", label.lower()))
     return next((word for word in words if word in METHODS), None)
 
 
 def assign(labels: Iterable[str]) -> Mapping[str, Look]:
-    """How the curves of a page look: a label that names a method as that method; any other, and a
-    second of the same method, as nothing else on the page. The same labels look the same."""
+    """How the curves of a page look, by label.
+
+    A label that names a method looks as that method does on every page; any other, and a second of
+    the same method, as nothing else on this page, in the colour that is used least. The same labels
+    look the same. There are 28 looks; of more curves than that, some look alike.
+    """
     names = list(dict.fromkeys(labels))
     looks: dict[str, Look] = {}
     for name in sorted(names, key=lambda name: name.lower() not in METHODS):  # exact ones first

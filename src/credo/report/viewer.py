@@ -4,22 +4,18 @@ A task says by `env.viewer()` how its world is drawn; time and its controls, rew
 policy's memory and the legend are the same for all (`static/viewer.js`).
 """
 
-import json
 import os
 from collections.abc import Mapping
-from functools import cache
-from importlib.resources import files as resources
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
-from markupsafe import Markup
 
 from ..analysis.memory import known_memory
 from ..environments.viewer import Viewer
 from ..runs import files
 from ..types import Trace
+from . import markup
 
 SPEEDS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # steps per second to choose from
 
@@ -29,9 +25,8 @@ def write(
 ) -> Path:
     """Write the page that plays these episodes to `path` and return it. A reader never sees half a
     file. Arguments and errors otherwise as of `page`."""
-    path = Path(path)
     files.write_text(path, page(viewer, traces, **options))
-    return path
+    return Path(path)
 
 
 def page(
@@ -46,36 +41,34 @@ def page(
     """
     if not traces:
         raise ValueError("there is no episode to play: give at least one")
-    first = next(iter(traces.values()))
-    agents = None if first.active is None else first.active.shape[1]
+    active = next(iter(traces.values())).active
     speed = float(f"{speed or viewer.speed:g}")
     data = {
-        "agents": agents,
+        "agents": None if active is None else active.shape[1],
         "agent": viewer.agent,
         "task": viewer.task,
         "legend": [vars(mark) for mark in viewer.legend],
         "episodes": [{"name": name, **_episode(viewer, trace)} for name, trace in traces.items()],
     }
-    known = f"static/viewer-{viewer.drawing}.js"
     own = Path(viewer.drawing)
-    return _template("viewer.html").render(
+    known = f"viewer-{viewer.drawing}.js"
+    return markup.render(
+        "viewer.html",
         title=title,
-        lead=viewer.lead,
+        viewer=viewer,
         drawing=own.stem,
-        names=list(traces),
-        agents=agents,
-        agent=viewer.agent,
-        speeds=[f"{s:g}" for s in sorted({*SPEEDS, speed})],
-        speed=f"{speed:g}",
-        data=_inside_script(json.dumps(_short(data), separators=(",", ":"), allow_nan=False)),
-        style=Markup(_text("static/base.css") + _text("static/viewer.css")),
-        player=Markup(_text("static/viewer.js")),
-        script=Markup(own.read_text("utf-8") if own.suffix == ".js" else _text(known)),
+        data=_short(data),
+        speeds=sorted({*SPEEDS, speed}),
+        speed=speed,
+        style=markup.static("base.css", "viewer.css"),
+        player=markup.static("viewer.js"),
+        script=files.read_text(own) if own.suffix == ".js" else markup.static(known),
     )
 
 
 def _episode(viewer: Viewer, trace: Trace) -> dict[str, Any]:
-    """What a page holds of an episode: of the task, and of every task."""
+    """What a page holds of an episode: what every task has (its length, how it ended, rewards by
+    name and step, the policy's memory), and what this task's drawing needs."""
     shown = viewer.rewards or tuple(trace.rewards)
     return {
         "steps": int(trace.length),
@@ -97,26 +90,9 @@ def _memory(trace: Trace) -> dict[str, Any] | None:
     return {"shared": memory.ndim == 2, "values": np.asarray(memory, np.float32)}
 
 
-def _inside_script(text: str) -> Markup:
-    """JSON that no "<" can end the script element of."""
-    return Markup(text.replace("<", "\\u003c"))
-
-
-def _text(name: str) -> str:
-    return resources("credo.report").joinpath(name).read_text("utf-8")
-
-
-@cache
-def _template(name: str) -> jinja2.Template:
-    loader = jinja2.PackageLoader("credo.report", "templates")
-    environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
-    )
-    return environment.get_template(name)
-
-
 def _short(value: Any) -> Any:
-    """Plain lists of the shortest numbers that are read back as the same 32 bits."""
+    """What JSON holds: of arrays plain lists of the shortest numbers that are read back as the same
+    32 bits; truth values are 0 and 1. Raises `ValueError` for a number that is not finite."""
     if value is None or isinstance(value, str):
         return value
     if isinstance(value, dict):
@@ -128,11 +104,10 @@ def _short(value: Any) -> Any:
         raise ValueError("an episode holds a number that is not finite: it cannot be replayed")
     if x.dtype.kind != "f":
         return x.astype(int).tolist()
-    if x.ndim:
-        return [_short(row) for row in x] if x.ndim > 1 else [_number(s) for s in x.astype(str)]
-    return _number(str(x))
+    return np.vectorize(_number, otypes=[object])(x.astype(str)).tolist()
 
 
 def _number(text: str) -> float | int:
+    """A number without a needless ".0"."""
     number = float(text)
     return int(number) if number.is_integer() else number

@@ -1,10 +1,13 @@
 """What `credo watch` makes of a run's best policy: an HTML page that plays, or a video."""
 
+import itertools
 import math
 import pathlib
+from collections.abc import Iterator
 from typing import Any
 
 import jax
+import numpy as np
 
 from .. import require
 from ..compilation import float32
@@ -15,6 +18,7 @@ from ..rollout import record
 from ..runs.policy import champion
 from ..runs.record import RunError
 from ..runs.store import Run
+from ..types import Trace
 from . import films, viewer
 
 FASTEST = 50  # pictures per second: browsers slow a gif down that has more
@@ -58,40 +62,40 @@ def watch(
     if fps is not None and not 0 < fps < math.inf:
         raise ValueError(f"fps is {fps}: it must be more than 0")
     env = run.algorithm.env
-    shown, filmed = env.viewer(), _filmed(env)
-    if shown is None and not filmed:
-        raise RunError(_nothing_to_see(run))
-    default = run.path / ("champion.gif" if shown is None else "champion.html")
-    output = default if output is None else pathlib.Path(output)
-    _check(output, shown is not None, filmed)
-    seeds = range(seed, seed + episodes)
+    shown, played = env.viewer(), isinstance(env.unwrapped, AbstractForeignEnvironment)
+    output, seeds = _target(run, output, shown is not None), range(seed, seed + episodes)
     if shown is not None and output.suffix.lower() == ".html":
         policy = champion(run)
         traces = {f"seed {s}": record(env, policy, key=jax.random.key(s)) for s in seeds}
         title = f"Credo: {run.path.name}"
-        return viewer.write(shown, traces, output, title=title, speed=fps)
-    if isinstance(env.unwrapped, AbstractForeignEnvironment):
-        return _film_outside(run, output, seeds, fps, size)
-    return _film_states(run, output, seeds, fps or (shown.speed if shown else STEPS), size)
+        viewer.write(shown, traces, output, title=title, speed=fps)
+    elif played:
+        _film_played(run, output, seeds, fps, size)
+    else:
+        _film_states(run, output, seeds, fps or (shown.speed if shown else STEPS), size)
+    return output
 
 
-def _filmed(env: Any) -> bool:
-    """Whether there can be a video of it."""
-    task = env.unwrapped
-    if isinstance(task, AbstractHostEnvironment):
-        return isinstance(task, AbstractForeignEnvironment)
-    return hasattr(task, "render")
-
-
-def _check(output: pathlib.Path, page: bool, filmed: bool) -> None:
+def _target(run: Run, output: str | pathlib.Path | None, page: bool) -> pathlib.Path:
+    """The file to write; `page`: whether the task has one that plays. Raises `RunError` if nothing
+    of the task can be drawn, `ValueError` for a kind of file that cannot be made of it."""
+    task = run.algorithm.env.unwrapped
+    drawn = not isinstance(task, AbstractHostEnvironment) and hasattr(task, "render")
+    filmed = drawn or isinstance(task, AbstractForeignEnvironment)
     kinds = [".html"] * page + [".mp4", ".gif"] * filmed
+    if not kinds:
+        raise RunError(_nothing_to_see(run))
+    if output is None:
+        return run.path / ("champion.html" if page else "champion.gif")
+    output = pathlib.Path(output)
     if output.suffix.lower() not in kinds:
-        *others, last = kinds
-        told = f"{', '.join(others)} or {last}" if others else last
-        raise ValueError(f"the output is to be {str(output)!r}: its name must end in {told}")
+        names = " or ".join(filter(None, [", ".join(kinds[:-1]), kinds[-1]]))
+        raise ValueError(f"the output is to be {str(output)!r}: its name must end in {names}")
+    return output
 
 
 def _nothing_to_see(run: Run) -> str:
+    """What is said of a task that cannot be drawn: which can, and what else shows the run."""
     return (
         f"{type(run.algorithm.env.unwrapped).__name__} has nothing to draw: what can be watched "
         "are rovers, T-mazes (up to 6 deep), server fleets, sequences, tasks of Gymnasium and "
@@ -103,43 +107,49 @@ def _nothing_to_see(run: Run) -> str:
 
 def _film_states(
     run: Run, output: pathlib.Path, seeds: range, rate: float, size: tuple[int, int]
-) -> pathlib.Path:
-    """A video of a task in JAX, from traces."""
+) -> None:
+    """A video of a task in JAX, from traces: every `stride`-th step, and the last one, at no more
+    than `FASTEST` pictures per second. `rate`: steps per second."""
     env, policy, stride = run.algorithm.env, champion(run), math.ceil(rate / FASTEST)
-    task = env.unwrapped
     with films.film(output, rate / stride) as add:
         for seed in seeds:
             trace = record(env, policy, key=jax.random.key(seed))
-            moments = [t for t in range(trace.length) if t % stride == 0] + [int(trace.length)]
-            if isinstance(task, Rover):
-                from . import trajectories  # matplotlib
-
-                shown = env.viewer().episode(trace)
-                for picture in trajectories.pictures(task, shown, f"seed {seed}", moments, size):
-                    add(picture)
-                continue
-            states = env.bare(trace.states)
-            for t in moments:
-                state = jax.tree.map(lambda x, t=t: x[t], states)
-                add(films.draw(lambda state=state: task.render(state), type(task).__name__))
-    return output
+            moments = [*range(0, trace.length, stride), int(trace.length)]
+            for picture in _pictures(env, trace, f"seed {seed}", moments, size):
+                add(picture)
 
 
-def _film_outside(
+def _pictures(
+    env: Any, trace: Trace, name: str, moments: list[int], size: tuple[int, int]
+) -> Iterator[np.ndarray]:
+    """An episode at these moments: of rovers as we draw them, of another task as it does."""
+    task = env.unwrapped
+    if isinstance(task, Rover):
+        from . import trajectories  # matplotlib
+
+        yield from trajectories.pictures(task, env.viewer().episode(trace), name, moments, size)
+        return
+    states = env.bare(trace.states)
+    for t in moments:
+        state = jax.tree.map(lambda x, t=t: x[t], states)
+        yield films.draw(lambda state=state: task.render(state), type(task).__name__)
+
+
+def _film_played(
     run: Run, output: pathlib.Path, seeds: range, fps: float | None, size: tuple[int, int]
-) -> pathlib.Path:
-    """A video of a task that draws itself, made while it is played."""
+) -> None:
+    """A video of a task that draws itself, made while it is played. `fps`: steps per second; None:
+    those that the environment names, else `STEPS`."""
     task, policy = run.algorithm.env.unwrapped, champion(run)
     with films.drawing(task, size) as (opened, env):
         rate = fps or getattr(env, "metadata", {}).get("render_fps") or STEPS
         stride = math.ceil(rate / FASTEST)
         with films.film(output, rate / stride) as add:
             for seed in seeds:
-                moment = iter(range(task.max_steps + 1))
+                moments = itertools.count()
 
-                def see(over: bool, moment=moment) -> None:
-                    if next(moment) % stride == 0 or over:
+                def see(over: bool, moments=moments) -> None:
+                    if next(moments) % stride == 0 or over:
                         add(films.draw(env.render, task.id, env))
 
                 record(opened, policy, key=jax.random.key(seed), seed=seed % 2**32, see=see)
-    return output

@@ -6,13 +6,18 @@ from typing import Any
 import numpy as np
 
 from .options import RunOptions
+from .record import RunError
 
 DEFAULT = {"generations": 1000}
 
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """A run ends after the first generation that reaches one of these. None: no such limit."""
+    """A run ends after the first generation that reaches one of these. None: no such limit.
+
+    Frames are environment steps of everything that plays; a team's joint step is one. Raises
+    `ValueError` without a limit of generations or of frames.
+    """
 
     generations: int | None = None
     frames: int | None = None  # environment steps of everything that played
@@ -23,29 +28,15 @@ class Budget:
             raise ValueError("a run needs a budget: give generations, frames or both")
 
     @classmethod
-    def of(cls, algorithm: Any, options: RunOptions) -> "Budget":
-        """As the options say, or else the `default_budget` of the algorithm, an object or a
-        class."""
-        if options.generations is None and options.frames is None:
-            limits = getattr(algorithm, "default_budget", DEFAULT)
-            return cls(**limits, stop_at=options.stop_at)
-        return cls(options.generations, options.frames, options.stop_at)
-
-    def going_on(self, algorithm: Any, options: RunOptions) -> "Budget":
-        """The budget of a run with this one that is resumed with these options."""
+    def of(cls, algorithm: Any, options: RunOptions, old: "Budget | None" = None) -> "Budget":
+        """As the options say; or else `old`, that of a run which goes on, or the `default_budget`
+        of the algorithm, an object or a class."""
         if options.generations is not None or options.frames is not None:
-            return Budget.of(algorithm, options)
-        return (
-            self if options.stop_at is None else dataclasses.replace(self, stop_at=options.stop_at)
-        )
-
-    @classmethod
-    def read(cls, record: dict[str, Any]) -> "Budget":
-        """As recorded in a config; those of older versions know no frames."""
-        return cls(**record)
-
-    def record(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)
+            return cls(options.generations, options.frames, options.stop_at)
+        budget = old or cls(**getattr(algorithm, "default_budget", DEFAULT))
+        if options.stop_at is None:
+            return budget
+        return dataclasses.replace(budget, stop_at=options.stop_at)
 
     @property
     def stop_score(self) -> np.float32:
@@ -77,30 +68,26 @@ class Budget:
 
     def share(self, generation: int, frames: int) -> float:
         """How far a run is, from 0 to 1."""
-        shares = [
-            done / limit
-            for done, limit in ((generation, self.generations), (frames, self.frames))
-            if limit is not None
-        ]
+        shares = generation / (self.generations or np.inf), frames / (self.frames or np.inf)
         return min(1.0, max(shares))
 
-    def refuse_smaller(self, old: "Budget", generation: int, frames: int) -> None:
-        """Raise if this is no more than a run with the budget `old` was to do, or has done."""
+    def refuse_smaller(self, old: "Budget", generation: int, frames: int, path: Any) -> None:
+        """Raise `RunError` if this is no more than the run at `path` with the budget `old` was to
+        do, or has done."""
         for name, done in (("generations", generation), ("frames", frames)):
-            new, before = getattr(self, name), getattr(old, name)
+            new, before, told = getattr(self, name), getattr(old, name), None
             if new is not None and before is not None and new < before:
-                raise ValueError(
-                    f"this run's budget is {before} {name}: a new budget must be larger, not {new}"
-                )
-            if new is not None and before is None and new < done:
-                raise ValueError(
-                    f"this run has done {done} {name}: a new budget must be larger, not {new}"
-                )
+                told = f"this run's budget is {before} {name}"
+            elif new is not None and before is None and new < done:
+                told = f"this run has done {done} {name}"
+            if told is not None:
+                raise RunError(f"{path}: {told}: a new budget must be larger, not {new}")
 
 
 def fitted(algorithm: Any, budget: Budget) -> Any:
     """`algorithm` with a replay buffer that is no larger than what `budget` can fill: as long as it
-    never wraps, its capacity changes no bit. What is recorded stays the user's number.
+    never wraps, its capacity changes no bit. What is recorded stays the user's number; in use is
+    the next power of two, so that budgets of about the same size are one program.
 
     It needs `most_frames`, an upper bound of the frames of one generation.
     """
@@ -113,16 +100,8 @@ def fitted(algorithm: Any, budget: Budget) -> Any:
         bounds.append(budget.generations * most)
     if budget.frames is not None:
         bounds.append(budget.frames - 1 + most)  # the last generation begins before the limit
-    # Budgets of about the same size share their programs.
     rows = min(capacity, 1 << (max(1, min(bounds)) - 1).bit_length())
     return dataclasses.replace(algorithm, replay_capacity=rows)
-
-
-def fitted_as(algorithm: Any, other: Any) -> Any:
-    """`algorithm` with the replay buffer of `other`, if they have one."""
-    if not hasattr(other, "replay_capacity"):
-        return algorithm
-    return dataclasses.replace(algorithm, replay_capacity=other.replay_capacity)
 
 
 def short(number: float) -> str:

@@ -83,50 +83,30 @@ class TensorBoard(Logger):
         return path
 
 
-class WandB(Logger):
-    """Metrics to Weights & Biases; with `WANDB_MODE=offline` into `wandb/` of the run's folder."""
+class Tracker(Logger):
+    """Metrics to the experiment tracker of this name. Weights & Biases writes, with
+    `WANDB_MODE=offline`, into `wandb/` of the run's folder; trackio into the user's cache."""
 
-    def __init__(self) -> None:
-        self.tracked: Any = None
+    def __init__(self, name: str) -> None:
+        self.name, self.tracked = name, None
 
     def on_generation(self, run: "Run", generation: int, metrics: Metrics) -> None:
         """One step, in a tracked run that a resumed one goes on with."""
         if self.tracked is None:
-            self.tracked = importlib.import_module("wandb").init(
-                dir=run.path,
-                id=_identity(run),
-                resume="allow",
-                settings={"console": "off"},  # the streams are ours
-                **_named(run),
-            )
+            own: dict[str, Any] = {"embed": False}
+            if self.name == "wandb":  # the streams are ours
+                own = {"dir": run.path, "id": _identity(run), "settings": {"console": "off"}}
+            config = {"algorithm": run.config["algorithm"], "seed": run.config["seed"]}
+            own |= {"name": f"{run.path.name}-{_identity(run)}", "config": config}
+            tracker = importlib.import_module(self.name)
+            self.tracked = tracker.init(project="credo", resume="allow", **own)
         self.tracked.log(_finite(metrics), step=generation)
 
     def on_end(self, run: "Run", reason: str) -> None:
         """The tracked run ends too."""
         if self.tracked is not None:
-            self.tracked.finish(exit_code=int(reason == "error"))
-
-
-class Trackio(Logger):
-    """Metrics to trackio, whose files lie in the user's cache."""
-
-    def __init__(self) -> None:
-        self.tracked: Any = None
-
-    def on_generation(self, run: "Run", generation: int, metrics: Metrics) -> None:
-        """One step, in a tracked run that a resumed one goes on with."""
-        if self.tracked is None:
-            trackio = importlib.import_module("trackio")
-            self.tracked = trackio.init(resume="allow", embed=False, **_named(run))
-        self.tracked.log(_finite(metrics), step=generation)
-
-    def on_end(self, run: "Run", reason: str) -> None:
-        """The tracked run ends too."""
-        if self.tracked is not None:
-            self.tracked.finish()
-
-
-LOGGERS: dict[str, type[Logger]] = {"wandb": WandB, "trackio": Trackio}
+            failed = {"exit_code": int(reason == "error")} if self.name == "wandb" else {}
+            self.tracked.finish(**failed)
 
 
 def of(options: "RunOptions") -> list[Callback]:
@@ -136,7 +116,7 @@ def of(options: "RunOptions") -> list[Callback]:
     for name in options.loggers:
         if importlib.util.find_spec(name) is None:
             raise RunError(f"{name} is not installed: pip install '.[{name}]' in a checkout")
-        heard.append(LOGGERS[name]())
+        heard.append(Tracker(name))
     for callback in options.callbacks:
         if not isinstance(callback, Callback) and not callable(callback):
             raise TypeError(f"{callback!r} is no callback: derive it from credo.Callback")
@@ -182,7 +162,7 @@ class Listeners:
                 if not isinstance(callback, Logger):
                     self.error = self.error or error
                     continue
-                name = type(callback).__name__
+                name = getattr(callback, "name", type(callback).__name__)
                 warnings.warn(f"{name} is no longer told: {error}; training goes on", stacklevel=4)
         return answers
 
@@ -197,13 +177,6 @@ class OnGeneration(Callback):
 def _finite(metrics: Metrics) -> dict[str, float]:
     told = {name: float(value) for name, value in metrics.items() if name != "generation"}
     return {name: value for name, value in told.items() if np.isfinite(value)}
-
-
-def _named(run: "Run") -> dict[str, Any]:
-    """What a tracker is told of a run."""
-    config = {"algorithm": run.config["algorithm"], "seed": run.config["seed"]}
-    name = f"{run.path.name}-{_identity(run)}"
-    return {"project": "credo", "name": name, "config": config}
 
 
 def _identity(run: "Run") -> str:

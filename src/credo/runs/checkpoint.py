@@ -48,7 +48,6 @@ CODES = {
     "float32": "F32",
     "float64": "F64",
 }
-DTYPES = {np.dtype(jnp.dtype(name)): code for name, code in CODES.items()}
 
 
 class CheckpointError(Exception):
@@ -60,7 +59,8 @@ class DamagedCheckpoint(UserWarning):
 
 
 class Checkpoint(eqx.Module):
-    """What `load` found."""
+    """What `load` found: the state and the tree besides it as JAX arrays, counters and seals as
+    they were given to `save`, and the folder they came from."""
 
     generation: int
     state: PyTree
@@ -124,7 +124,7 @@ def save(
         _remove_unfinished(directory)
         if not folder.exists() or damage(folder, reread=False):
             _write_folder(folder, _chunks(header, leaves), text, parts, there, seals)
-        elif (commit := _commit(folder)).get("seals", {}) != seals:
+        elif (commit := _commit(folder))["seals"] != seals:
             text = _commit_text(generation, commit["files"], seals)
             files.write_whole(folder / COMMIT, [text])
     _remove_beyond(keep, folder)
@@ -169,7 +169,7 @@ def load(
     for folder in folders:
         reason = damage(folder, replay=not without_replay)
         if reason is None and check is not None:
-            reason = check(int(folder.name), _commit(folder).get("seals", {}))
+            reason = check(int(folder.name), _commit(folder)["seals"])
         if reason is None:
             _warn_of(damaged, folder, without_replay)
             return _loaded(folder, like, extra, without_replay)
@@ -182,6 +182,7 @@ def load(
 
 
 def _warn_of(damaged: Mapping[str, str], used: Path, without_replay: bool) -> None:
+    """Name each checkpoint that was passed over, and a buffer that is left out."""
     for name, why in damaged.items():
         warnings.warn(
             f"checkpoint {used.with_name(name)} is damaged ({why}): using {used.name} instead",
@@ -197,17 +198,19 @@ def _warn_of(damaged: Mapping[str, str], used: Path, without_replay: bool) -> No
 
 
 def _loaded(folder: Path, like: PyTree, extra: PyTree, without_replay: bool) -> Checkpoint:
+    """Read a checkpoint that was found whole. Raises `CheckpointError` if it does not fit
+    `like`."""
     metadata, arrays = _read(folder / STATE)
     more = {name: arrays.pop(name) for name in list(arrays) if name.startswith(EXTRA)}
     empty = segments.names(like) if without_replay else set()
     with _explained(f"cannot read {folder}", folder):
-        arrays |= segments.stored(folder, metadata.get(REPLAY, "[]"))
+        commit = _commit(folder)
+        arrays |= segments.stored(folder, commit["files"], metadata.get(REPLAY, "[]"))
         state = _fit(folder / STATE, like, arrays, metadata, empty)
         more = {name.removeprefix(EXTRA): array for name, array in more.items()}
         extra = _fit(folder / STATE, extra, more, metadata) if more and extra is not None else None
         counters = json.loads(files.read_bytes(folder / COUNTERS))
-        seals = _commit(folder).get("seals", {})
-    return Checkpoint(int(folder.name), state, counters, folder, seals, extra)
+    return Checkpoint(int(folder.name), state, counters, folder, commit["seals"], extra)
 
 
 def damage(folder: Path, *, reread: bool = True, replay: bool = True) -> str | None:
@@ -217,28 +220,29 @@ def damage(folder: Path, *, reread: bool = True, replay: bool = True) -> str | N
     be as they were if their file was not touched since; without `replay` they are not looked at.
     """
     try:
-        names = set(os.listdir(folder))
+        names = os.listdir(folder)
         if not names:
             return "the folder is empty"
         if COMMIT not in names:
             return f"it has no {COMMIT}: writing it was never finished"
-        if missing := {STATE, COUNTERS} - names:
-            return f"{' and '.join(sorted(missing))} is missing"
-        committed = files.read_bytes(folder / COMMIT)
-        commit = _parsed(committed)
-        found = {name: _looked_at(folder / name, commit) for name in (STATE, COUNTERS)}
-        if not replay:
-            names = set()
-            found |= {
-                name: f for name, f in commit["files"].items() if segments.NAME.fullmatch(name)
-            }
-        for name in filter(segments.NAME.fullmatch, names):
-            found[name] = _looked_at(folder / name, commit, reread=reread)
+        then = _commit(folder)["files"]
+        looked_at = [name for name in then if replay or not segments.NAME.fullmatch(name)]
+        if missing := sorted(set(looked_at).difference(names)):
+            return f"{' and '.join(missing)} is missing"
+        differing = (_differs(folder / name, then[name], reread) for name in looked_at)
+        return next(filter(None, differing), None)
+    except CheckpointError as error:
+        return str(error)
     except (OSError, ValueError) as error:
         return f"it cannot be read: {error}"
-    if committed == _commit_text(int(folder.name), found, commit["seals"]):
-        return None
-    return _difference(commit["files"], found)
+
+
+def seals_of(folder: Path) -> dict[str, Any]:
+    """The seals of the checkpoint in `folder`; none if they cannot be read."""
+    try:
+        return _commit(folder)["seals"]
+    except (OSError, ValueError, CheckpointError):
+        return {}
 
 
 def export_policy(path: Path, tree: PyTree, metadata: Mapping[str, str] | None = None) -> None:
@@ -291,6 +295,7 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _describe(leaf: Any) -> str:
+    """A leaf as `float32[3, 2]`, by which two are the same; a typed key as `key<fry>[]`."""
     return f"{leaf.dtype}{list(leaf.shape)}"
 
 
@@ -306,9 +311,9 @@ def _leaves(tree: PyTree, extra: PyTree = None) -> tuple[dict[str, Any], dict[st
             raise CheckpointError(f"two leaves are named {name}: give them different names")
         if _is_key(leaf):
             keys[name], leaf = str(jax.random.key_impl(leaf)), jax.random.key_data(leaf)
-        if leaf.dtype not in DTYPES or jax.dtypes.canonicalize_dtype(leaf.dtype) != leaf.dtype:
+        if str(leaf.dtype) not in CODES or jax.dtypes.canonicalize_dtype(leaf.dtype) != leaf.dtype:
             raise CheckpointError(
-                f"leaf {name} is {_describe(leaf)}: stored are {', '.join(map(str, DTYPES))}, "
+                f"leaf {name} is {_describe(leaf)}: stored are {', '.join(CODES)}, "
                 "and 64 bits only where jax_enable_x64 is on; convert it"
             )
         leaves[name] = leaf
@@ -358,6 +363,8 @@ def _fit(
 
 
 def _check_same(path: Path, expected: dict[str, str], found: dict[str, str]) -> None:
+    """Raise `CheckpointError`, which names the first ten, if leaves differ by name, shape or
+    dtype."""
     differing = [
         f"\n  {name}: found {found.get(name, 'no array')}, "
         f"expected {expected.get(name, 'no array')}"
@@ -377,6 +384,7 @@ def _check_same(path: Path, expected: dict[str, str], found: dict[str, str]) -> 
 
 
 def _bytes(leaf: Any) -> memoryview:
+    """All bytes of an array in C order; of one on a device a copy."""
     return np.ascontiguousarray(leaf).reshape(-1).view(np.uint8).data
 
 
@@ -385,11 +393,15 @@ def _size(leaves: Mapping[str, Any]) -> int:
 
 
 def _header(leaves: Mapping[str, Any], metadata: Mapping[str, str]) -> bytes:
+    """What stands before the arrays: eight bytes of length, then JSON of dtypes, shapes and places.
+
+    Its order is ours, so that equal states are equal bytes: the library orders metadata at random.
+    """
     entries: dict[str, Any] = {"__metadata__": metadata}
     end = 0
     for name, leaf in leaves.items():
         start, end = end, end + leaf.nbytes
-        code = DTYPES[leaf.dtype]
+        code = CODES[str(leaf.dtype)]
         entries[name] = {"dtype": code, "shape": leaf.shape, "data_offsets": [start, end]}
     text = json.dumps(entries).encode()
     text += b" " * (-len(text) % 8)
@@ -397,6 +409,7 @@ def _header(leaves: Mapping[str, Any], metadata: Mapping[str, str]) -> bytes:
 
 
 def _chunks(header: bytes, leaves: Mapping[str, Any]) -> Iterator[bytes | memoryview]:
+    """A whole file, piece by piece: no second copy of an array is held."""
     yield header
     for leaf in leaves.values():
         yield from leaf.pieces() if isinstance(leaf, segments.Rows) else [_bytes(leaf)]
@@ -412,6 +425,7 @@ def _checksum(metadata: Mapping[str, str], leaves: Mapping[str, Any]) -> str:
 
 
 def _plain_text(what: str, values: dict[str, Any]) -> bytes:
+    """Values as JSON. Raises `ValueError` if they would not come back as they are."""
     text = json.dumps(values, indent=2)
     # Python's text of a float is exact, and its comparison by text also holds for NaN.
     if repr(json.loads(text)) != repr(values):
@@ -426,7 +440,7 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
     """The metadata and the arrays of a file."""
     try:
         with _explained(f"cannot read {path}", path.parent):
-            os.close(files.opened(path, os.O_RDONLY, follow=True))  # the library waits for a pipe
+            files.reading(path).close()  # the library waits for a pipe
             with safe_open(path, framework="numpy") as file:
                 metadata, names = file.metadata() or {}, file.keys()
                 return metadata, {name: file.get_tensor(name) for name in names}
@@ -435,6 +449,8 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
 
 
 def _read_rows(stored: segments.Stored) -> np.ndarray:
+    """A whole leaf of a buffer. Raises `CheckpointError` if a part of it is not what its name
+    says."""
     try:
         return stored.read()
     except (SafetensorError, ValueError) as error:
@@ -442,6 +458,8 @@ def _read_rows(stored: segments.Stored) -> np.ndarray:
 
 
 def _read_export(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
+    """Metadata and arrays of an exported policy, whose SHA-256 is right; raises
+    `CheckpointError`."""
     metadata, arrays = _read(path)
     checksum = metadata.pop(CHECKSUM, None)
     if checksum is None or KEYS not in metadata:
@@ -475,6 +493,7 @@ def _remove_unfinished(directory: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
+    """Remove a checkpoint. Raises `OSError` if it cannot even be renamed."""
     # Under another name first: killed half-way, it must not look like a damaged checkpoint.
     removed = _beside(folder, "removed")
     files.remove(removed)
@@ -529,7 +548,7 @@ def _write_folder(
         for name, rows in parts.items():
             if not (name in there and _link(there[name], partial / name)):
                 _write_part(partial / name, rows)
-            found[name] = _part_fingerprint(partial / name, reread=False)
+            found[name] = _known_fingerprint(partial / name, reread=False)
         _write(partial / COMMIT, [_commit_text(int(folder.name), found, seals)])
         files.sync(partial)
         if os.path.lexists(folder):
@@ -547,11 +566,13 @@ _seen: dict[tuple[int, ...], dict[str, Any]] = {}  # fingerprints, by what tells
 
 
 def _identity(path: Path) -> tuple[int, ...]:
+    """What tells a file from any other, and from itself after a write."""
     status = os.stat(path)
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def _part_fingerprint(path: Path, *, reread: bool) -> dict[str, Any]:
+def _known_fingerprint(path: Path, *, reread: bool) -> dict[str, Any]:
+    """That of a file, which is read if this process has not seen it, or to `reread` it."""
     identity = _identity(path)
     if reread or identity not in _seen:
         _seen[identity] = _fingerprint(path)
@@ -559,6 +580,7 @@ def _part_fingerprint(path: Path, *, reread: bool) -> dict[str, Any]:
 
 
 def _write_part(path: Path, rows: Mapping[str, segments.Rows]) -> None:
+    """Write a file of rows, of which the fingerprint is known from now on."""
     order = sorted(rows, key=lambda name: (-rows[name].dtype.itemsize, name))
     rows = {name: rows[name] for name in order}
     fingerprint = _write(path, _chunks(_header(rows, {}), rows))
@@ -580,7 +602,11 @@ def _linkable(
     folder: Path, parts: Mapping[str, Mapping[str, segments.Rows]], needed: int, keep: int
 ) -> tuple[dict[str, Path], int]:
     """Where files of these parts are that the checkpoint in `folder` may share, and how many bytes
-    the others take, besides the `needed` ones."""
+    the others take, besides the `needed` ones.
+
+    None of the checkpoint just before, so that no damaged file spoils two in a row; unless only one
+    checkpoint is kept, or so little is free that the next one might not fit: that is a warning.
+    """
 
     def size(there: Mapping[str, Path]) -> int:
         return sum(_size(rows) for name, rows in parts.items() if name not in there)
@@ -612,14 +638,15 @@ def _intact_parts(directory: Path, names: Iterable[str], but: Path | None) -> di
                 path = folder / name
                 if _identity(path)[:2] in taken:
                     continue
-                if _part_fingerprint(path, reread=False) == written[name]:
+                if _known_fingerprint(path, reread=False) == written[name]:
                     there[name] = path
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, CheckpointError):
             continue  # damaged: what only it has is written again
     return there
 
 
 def _files_in(folder: Path) -> set[tuple[int, ...]]:
+    """Device and inode of all files in a folder; none if it cannot be read."""
     with contextlib.suppress(OSError):
         return {_identity(folder / name)[:2] for name in os.listdir(folder)}
     return set()
@@ -641,59 +668,44 @@ def _write(path: Path, chunks: Iterable[bytes | memoryview]) -> dict[str, Any]:
 
 
 def _fingerprint(path: Path) -> dict[str, Any]:
-    with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
+    """Size and SHA-256 of a file, read in pieces. Raises `OSError`."""
+    with files.reading(path) as file:
         return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), "bytes": file.tell()}
 
 
-def _looked_at(path: Path, commit: Mapping[str, Any], *, reread: bool = True) -> dict[str, Any]:
-    """The fingerprint of a file; of one that has another size than it should, only that."""
+def _differs(path: Path, then: Mapping[str, Any], reread: bool) -> str | None:
+    """How a file differs from what COMMIT says of it."""
     size = os.stat(path).st_size
-    should = commit["files"].get(path.name)
-    if should is not None and size != should["bytes"]:
-        return {"sha256": None, "bytes": size}
-    part = segments.NAME.fullmatch(path.name)
-    return _part_fingerprint(path, reread=reread) if part else _fingerprint(path)
+    if size != then["bytes"]:
+        return f"{path.name} has {size} bytes, {COMMIT} says {then['bytes']}"
+    reread = reread or not segments.NAME.fullmatch(path.name)
+    if _known_fingerprint(path, reread=reread) != then:
+        return f"the SHA-256 of {path.name} is not the one in {COMMIT}"
+    return None
 
 
 def _commit(folder: Path) -> dict[str, Any]:
-    """What COMMIT says. Raises `OSError` and `ValueError`."""
-    return _parsed(files.read_bytes(folder / COMMIT))
+    """The files and seals that COMMIT names. Raises `OSError`, `ValueError` if it is too large, and
+    `CheckpointError` if it is not as it was written."""
+    committed = files.read_bytes(folder / COMMIT)
+    with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        said = json.loads(committed)
+        found, seals = said["files"], dict(said.get("seals", {}))
+        whole = {STATE, COUNTERS} <= found.keys() and all(
+            f.keys() == {"bytes", "sha256"} for f in found.values()
+        )
+        if whole and committed == _commit_text(int(folder.name), found, seals):
+            return {"files": found, "seals": seals}
+    raise CheckpointError(f"{COMMIT} is not as it was written")
 
 
-def _parsed(committed: bytes) -> dict[str, Any]:
-    """The same of its text, `seals` and all; of no files if it does not say as we do."""
-    try:
-        commit = json.loads(committed)
-        found = {
-            str(name): {k: f[k] for k in ("bytes", "sha256")} for name, f in commit["files"].items()
-        }
-        return {"files": found, "seals": dict(commit.get("seals", {}))}
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return {"files": {}, "seals": {}}
-
-
-def _commit_text(
-    generation: int, files: Mapping[str, dict[str, Any]], seals: Mapping[str, Any] = {}
-) -> bytes:
+def _commit_text(generation: int, files: Mapping[str, Any], seals: Mapping[str, Any] = {}) -> bytes:
+    """COMMIT as it is written, byte for byte. Seals are hashed too: no file stands for them."""
     commit: dict[str, Any] = {"generation": generation, "files": files}
     if seals:
         text = json.dumps(seals, sort_keys=True)
         commit |= {"seals": seals, "sha256 of seals": hashlib.sha256(text.encode()).hexdigest()}
     return json.dumps(commit, indent=2, sort_keys=True).encode()
-
-
-def _difference(then: Mapping[str, Any], found: Mapping[str, dict[str, Any]]) -> str:
-    """Which file is not as COMMIT says."""
-    if missing := set(then).difference(found):
-        return f"{' and '.join(sorted(missing))} is missing"
-    for name, now in found.items() if then else ():
-        if name not in then:
-            break
-        if now["bytes"] != then[name]["bytes"]:
-            return f"{name} has {now['bytes']} bytes, {COMMIT} says {then[name]['bytes']}"
-        if now["sha256"] != then[name]["sha256"]:
-            return f"the SHA-256 of {name} is not the one in {COMMIT}"
-    return f"{COMMIT} is not as it was written"
 
 
 @contextlib.contextmanager

@@ -38,7 +38,6 @@ from ..networks.base import AbstractNetwork
 from ..networks.exploration import AbstractNoise
 from ..networks.mlp import AbstractCritic
 from ..require import suggestion
-from . import files
 
 EXTENSIONS = (
     AbstractEnvironment,
@@ -85,7 +84,7 @@ def to_tree(value: Any) -> Any:
 def from_tree(tree: Any, *, trust: bool = True, source: str = "this record") -> Any:
     """The object that `to_tree` recorded.
 
-    **Arguments:** `trust`: whether classes and environments of somebody's own may be imported, as
+    **Arguments:** `trust`: whether classes and environments of others may be imported, as
     in a record of this user. Without it a record that names any is refused before that.
     `source`: whose record it is, for messages.
 
@@ -115,8 +114,9 @@ def from_tree(tree: Any, *, trust: bool = True, source: str = "this record") -> 
 
 
 def _untrusted(source: str, named: str) -> str:
+    """Why a record is not read, and what to do."""
     return (
-        f"{source} was not made here and names {named}, which is somebody's own code: look into "
+        f"{source} was not made here and names {named}, which is code of others: look into "
         "config.json, then give --trust (from Python Run(path, trust=True))"
     )
 
@@ -334,6 +334,7 @@ def _version(package: str) -> str | None:
 
 
 def _processor() -> str:
+    """The name of the processor as the system has it."""
     try:
         for line in pathlib.Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -341,11 +342,6 @@ def _processor() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine()
-
-
-def write_json(path: pathlib.Path, value: Any) -> None:
-    """Write a file that is either the old one or the whole new one."""
-    files.write_json(path, value)
 
 
 def flatten(tree: Any, path: str = "") -> dict[str, Any]:

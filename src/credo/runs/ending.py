@@ -1,7 +1,7 @@
 """How a command ends: one line on stderr and an exit code, whatever was raised.
 
 0: done. 1: it failed. 2: it was asked for wrongly. 128 + n: signal n, so 130 after Ctrl-C and 141
-where nobody reads what is printed. What nobody foresaw leaves its traceback in a file, which the
+where what is printed is not read. What was not foreseen leaves its traceback in a file, which the
 line names. Nothing here imports JAX.
 """
 
@@ -100,7 +100,7 @@ def _exit(error: SystemExit) -> Any:
 
 
 def _unread() -> bool:
-    """Whether nobody reads stdout any more; what is still to be written there goes nowhere."""
+    """Whether stdout is not read any more; what is still to be written there goes nowhere."""
     try:
         number, poll = sys.stdout.fileno(), select.poll()
         poll.register(number, 0)
@@ -130,7 +130,7 @@ def _raised_here(error: BaseException) -> str:
 
 
 def place(error: BaseException) -> str:
-    """Where somebody's own code raised this, as `file:line`; "" if it was raised in
+    """Where code of others raised this, as `file:line`; "" if it was raised in
     ours or in a package."""
     installed = (ROOT, sys.prefix, sys.base_prefix)
     for at in reversed(traceback.extract_tb(error.__traceback__)):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from .. import tree
-from ..analysis import counting, floors
+from ..analysis import bounds, counting
 from ..compilation import float32
 from ..environments.host import AbstractHostEnvironment
 from ..environments.sequence_classification import SequenceClassification
@@ -34,7 +34,7 @@ def in_turn(task: Any, policies: Any, episodes: int, *, key: PRNGKeyArray) -> Ev
 
 
 class Score(NamedTuple):
-    """What one reward signal came to."""
+    """What one reward came to, in the task's own units: returns over episodes that ended."""
 
     mean: float
     error: float  # standard error of the mean over episodes; NaN of a single one
@@ -51,16 +51,14 @@ class Result(NamedTuple):
 
 
 @float32()
-def played(run: Run, task: Any, episodes: int | None, seed: int, *, best: bool = False) -> Result:
-    """Fresh episodes of a run's champion, or of its `best` policy, on `task`, which may differ from
+def played(run: Run, task: Any, episodes: int | None, seed: int) -> Result:
+    """Fresh episodes of a run's champion on `task`, which may differ from
     the one it was trained on. `episodes`: None for `EPISODES`, or `HOST_EPISODES` of a task outside
     JAX."""
     if episodes is None:
         host = issubclass(type(task), AbstractHostEnvironment)
         episodes = HOST_EPISODES if host else EPISODES
-    evaluation = in_turn(
-        task, tree.stack(run.best if best else run.champion), episodes, key=_key(seed)
-    )
+    evaluation = in_turn(task, tree.stack(run.champion), episodes, key=_key(seed))
     returns = {name: np.asarray(evaluation.returns[name][0], np.float64) for name in task.signals}
     whole = ~np.any([np.isnan(x.reshape(episodes, -1)).any(1) for x in returns.values()], axis=0)
     scores = {name: _score(values[whole]) for name, values in returns.items()}
@@ -70,13 +68,17 @@ def played(run: Run, task: Any, episodes: int | None, seed: int, *, best: bool =
 
 
 def describe(
-    run: Run, task: Any, episodes: int | None, seed: int, *, best: bool = False
+    run: Run, task: Any, episodes: int | None, seed: int
 ) -> tuple[list[str], Result | None]:
     """What `played` finds, in lines for people. Sequences so deep that they are streamed have no
-    result beside them."""
+    result beside them.
+
+    **Arguments:** as `played`: `episodes`, at least 1, or None for the default of the task; `seed`
+    of the fresh episodes, which no training run has, whatever its own seed.
+    """
     if _streamed(task):
-        return list(_stream(run, task, episodes, seed, best)), None
-    result = played(run, task, episodes, seed, best=best)
+        return list(_stream(run, task, episodes, seed)), None
+    result = played(run, task, episodes, seed)
     return list(_lines(run, task, result)), result
 
 
@@ -104,13 +106,15 @@ def _lines(run: Run, task: Any, result: Result) -> Iterator[str]:
         for k, mean in enumerate(score.agents):
             yield f"    agent {k:<8} {mean:.4g}"
     yield f"  steps            {result.steps:.1f}"
-    if floors.known(task):
-        name, value = floors.floor(task)
-        yield f"  floor            {value:.3g} ({name}), ceiling {floors.CEILING:.3g}"
+    if bounds.exact(task):
+        name, value = bounds.best_baseline(task)
+        yield f"  baseline         {value:.3g} ({name})"
+        yield f"  upper bound      {bounds.upper_bound(task).value:.3g}"
 
 
 def summary(path: pathlib.Path, results: list[Result]) -> Iterator[str]:
-    """Several runs together: a run's mean is one value."""
+    """Several runs together, in lines for people: a run's mean is one value, and ± is the standard
+    error over runs."""
     yield f"{path}: {len(results)} runs, mean ± standard error over runs"
     for name in results[0].scores:
         yield _line(name, _score(np.array([result.scores[name].mean for result in results])))
@@ -122,6 +126,7 @@ def _line(name: str, score: Score) -> str:
 
 
 def _key(seed: int) -> PRNGKeyArray:
+    """The key of fresh episodes."""
     return jax.random.fold_in(jax.random.key(seed), 1_000_003)  # not a key of any training run
 
 
@@ -132,12 +137,12 @@ def _streamed(task: Any) -> bool:
 
 
 def _stream(
-    run: Run, task: SequenceClassification, episodes: int | None, seed: int, best: bool
+    run: Run, task: SequenceClassification, episodes: int | None, seed: int
 ) -> Iterator[str]:
     """Lines about the champion on sequences of any length, whose memory does not grow with it."""
     streams = min(episodes or EPISODES, 20)
     lengths = counting.longest_correct(
-        tree.stack(run.best if best else run.champion),
+        tree.stack(run.champion),
         task.depth,
         streams,
         min_gap=task.min_gap,

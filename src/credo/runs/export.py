@@ -18,8 +18,8 @@ from .store import Run
 Weights = dict[str, np.ndarray]
 
 
-def export(run: Run, path: str | pathlib.Path, *, best: bool = False) -> pathlib.Path:
-    """Write a run's champion, or its `best` policy, to one safetensors file, for
+def export(run: Run, path: str | pathlib.Path) -> pathlib.Path:
+    """Write a run's champion to one safetensors file, for
     `credo.runner.Runner.load`.
 
     Its metadata describe the network, the sizes and, for a task of Gymnasium or PettingZoo, the
@@ -31,7 +31,7 @@ def export(run: Run, path: str | pathlib.Path, *, best: bool = False) -> pathlib
     path = pathlib.Path(path)
     if not path.parent.is_dir():
         raise RunError(f"{path.parent} is no folder: make it first, or name another file")
-    policy = champion(run, best=best)
+    policy = champion(run)
     network, weights = parts_of(policy)
     description = json.dumps(_describe(run, network))
     metadata = {DESCRIPTION: description, FINGERPRINT: fingerprint(description, weights)}
@@ -92,6 +92,8 @@ KINDS: dict[str, tuple[str, Any, Any]] = {
 
 
 def _describe(run: Run, network: dict[str, Any]) -> dict[str, Any]:
+    """What the runner must know, from the record of the run alone: sizes, actions, names of
+    agents."""
     env, task = run.config["algorithm"]["env"], task_of(run)
     while "id" not in env and "env" in env:  # what pays rewards later, say
         env = env["env"]

@@ -1,6 +1,6 @@
 """Files: written whole or not at all, through no link, and read without waiting.
 
-A folder of a run may come from somebody else, or be looked at by anybody while it is written. So
+A folder of a run may come from another user, or be looked at by others while it is written. So
 what stands under a name that is to be written is never followed or trusted: a draft is a new file,
 and what is appended to is a regular file. What is read is a regular file of a bounded size: a
 pipe would make its reader wait for ever, and a sparse file may be larger than the memory.
@@ -8,6 +8,7 @@ pipe would make its reader wait for ever, and a sparse file may be larger than t
 
 import contextlib
 import errno
+import io
 import json
 import os
 import shutil
@@ -46,12 +47,12 @@ def _drafted(path: str | os.PathLike[str]) -> Iterator[tuple[Path, int]]:
     try:
         yield draft, descriptor
         if os.fstat(descriptor).st_nlink == 0:
-            raise OSError(errno.EBUSY, "somebody else writes it at the same time", str(path))
+            raise OSError(errno.EBUSY, "another process writes it at the same time", str(path))
         os.fsync(descriptor)
         os.replace(draft, path)
     except BaseException as error:
         with contextlib.suppress(OSError):  # the first error counts
-            if os.fstat(descriptor).st_nlink:  # or it would be somebody else's
+            if os.fstat(descriptor).st_nlink:  # or it would be another user's
                 remove(draft)
         if isinstance(error, OSError):
             raise named(error, path) from error
@@ -120,9 +121,8 @@ def remove(path: str | os.PathLike[str]) -> None:
 def read_bytes(path: str | os.PathLike[str], most: int = MOST) -> bytes:
     """A regular file. Raises `OSError` if it is none or cannot be read, and `ValueError` if it has
     more than `most` bytes; both name it."""
-    descriptor = opened(path, os.O_RDONLY, follow=True)
-    with open(descriptor, "rb") as file:
-        size = os.fstat(descriptor).st_size
+    with reading(path) as file:
+        size = os.fstat(file.fileno()).st_size
         if size > most:
             raise ValueError(f"{path} has {size:,} bytes: at most {most:,} are read")
         return file.read()
@@ -137,6 +137,11 @@ def read_text(path: str | os.PathLike[str], most: int = MOST) -> str:
             f"{path} is damaged: its byte {error.start} is {error.object[error.start]:#x}, "
             "which is no UTF-8 text"
         ) from None
+
+
+def reading(path: str | os.PathLike[str]) -> io.BufferedReader:
+    """A regular file, open for reading: never waits, and a link is followed. Raises `OSError`."""
+    return open(opened(path, os.O_RDONLY, follow=True), "rb")
 
 
 def opened(path: str | os.PathLike[str], flags: int, *, follow: bool = False) -> int:

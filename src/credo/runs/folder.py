@@ -4,7 +4,7 @@ import contextlib
 import os
 import pathlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from . import files, screen
@@ -13,9 +13,12 @@ from .lock import is_lock, lock
 from .names import run_name
 from .record import NAME, RunError
 
-DRAFT = re.compile(r"\.config\.json\.draft(\.json)?")
-FIRST = re.compile(r"\.?0{8}[\w.-]*")  # the checkpoint of generation 0, finished or not
-PART = re.compile(r"\.?(state\.safetensors|counters\.json|COMMIT|replay\d[\w.-]*)(\.draft\w*)?")
+LEFT = re.compile(
+    r"lock|\.config\.json\.draft(\.json)?|checkpoints(/\.?0{8}[\w.-]*"
+    r"(/\.?(state\.safetensors|counters\.json|COMMIT|replay\d[\w.-]*)(\.draft\w*)?)?)?"
+)
+"""What a process leaves in a folder that dies before its run begins: nothing but the first
+checkpoint, or less, and what holds the folder meanwhile."""
 
 
 def runs_in(path: str | pathlib.Path) -> list[pathlib.Path]:
@@ -34,10 +37,9 @@ def runs_in(path: str | pathlib.Path) -> list[pathlib.Path]:
     return sorted(inside, key=lambda run: number.sub(lambda m: m[0].zfill(20), run.name))
 
 
-def free_name(algorithm: Any, seed: int | str, label: str = "") -> pathlib.Path:
-    """A folder that does not exist. `label`: what stands before the seed; by default the words for
-    the algorithm and the task (`names.run_name`)."""
-    label = label or run_name(to_tree(algorithm))
+def free_name(algorithm: Any, seed: int | str) -> pathlib.Path:
+    """A folder that does not exist, named by the words for the algorithm and the task."""
+    label = run_name(to_tree(algorithm))
     name = re.sub(r"[^\w.]+", "-", f"{label}-{seed}".lower())
     path, copies = pathlib.Path("runs") / name, 1
     while path.exists():
@@ -75,31 +77,14 @@ def new_folder(path: pathlib.Path) -> Iterator[None]:
         raise
 
 
-def _leftover(path: pathlib.Path) -> bool:
-    """Whether all that is in a folder was left by a process of ours that died before its run began:
-    nothing but the first checkpoint, or less, and what holds the folder meanwhile."""
-    for entry in path.iterdir():
-        if entry.name == "lock" or DRAFT.fullmatch(entry.name):
-            ours = entry.is_file() and not entry.is_symlink()
-            ours = ours and (entry.name != "lock" or is_lock(entry))
-        else:
-            ours = entry.name == "checkpoints" and _holds(entry, _first_checkpoint)
-        if not ours:
-            return False
-    return True
-
-
-def _first_checkpoint(path: pathlib.Path) -> bool:
-    return FIRST.fullmatch(path.name) is not None and _holds(
-        path, lambda file: bool(PART.fullmatch(file.name)) and file.is_file()
-    )
-
-
-def _holds(path: pathlib.Path, ours: Callable[[pathlib.Path], bool]) -> bool:
-    """Whether `path` is a folder of which every entry is one of ours, and none is a link."""
-    if path.is_symlink() or not path.is_dir():
+def _left(folder: pathlib.Path, path: pathlib.Path) -> bool:
+    """Whether something in a folder was left by a process that died before its run began."""
+    name = path.relative_to(folder).as_posix()
+    if path.is_symlink() or not LEFT.fullmatch(name):
         return False
-    return all(ours(entry) and not entry.is_symlink() for entry in path.iterdir())
+    if name == "checkpoints" or path.parent.name == "checkpoints":
+        return path.is_dir()
+    return path.is_file() and (name != "lock" or is_lock(path))
 
 
 def _refuse_occupied(path: pathlib.Path) -> None:
@@ -113,7 +98,7 @@ def _refuse_occupied(path: pathlib.Path) -> None:
             f"{path} holds a run already: `credo resume {path}` goes on with it; choose another "
             "path for a new one"
         )
-    if not _leftover(path):
+    if not all(_left(path, entry) for entry in path.rglob("*")):
         names = sorted(os.listdir(path))
         more = ", …" if len(names) > 3 else ""
         raise RunError(

@@ -56,6 +56,7 @@ def lock(run_directory: Path) -> Iterator[None]:
 
 
 def _is_at(descriptor: int, path: Path) -> bool:
+    """Whether the file that is open is the one that has this name now."""
     try:
         return os.path.samestat(os.fstat(descriptor), os.stat(path))
     except FileNotFoundError:
@@ -73,7 +74,7 @@ def is_lock(path: Path) -> bool:
 
 def _write(descriptor: int, content: str) -> None:
     # The name is only for others to read: on a full disk the lock holds without it, and a file
-    # with a second name may be somebody else's.
+    # with a second name may be another user's.
     with contextlib.suppress(OSError):
         if os.fstat(descriptor).st_nlink == 1:
             os.truncate(descriptor, 0)
@@ -81,6 +82,7 @@ def _write(descriptor: int, content: str) -> None:
 
 
 def _message(run_directory: Path, content: str) -> str:
+    """Who holds the lock, from what the file says, and what to do."""
     who, stop = "another process", "stop it"
     # Between its lock and its name a holder's file is empty.
     with contextlib.suppress(ValueError, KeyError, TypeError):

@@ -9,12 +9,13 @@ of the other two is a warning, once, and training goes on without them.
 import contextlib
 import csv
 import hashlib
+import io
 import os
 import pathlib
 import stat
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,8 @@ class Log:
     """Appends rows. A run that is resumed is cut back to its checkpoint, so that generations are
     strictly increasing and equal to those of an undisturbed run.
 
-    `elapsed`: seconds of training before, as far as `timing.csv` tells.
+    `elapsed`: seconds of training before, as far as `timing.csv` tells. `size`, `digest`: bytes and
+    running SHA-256 of `metrics.csv`, as it was written. `clock`: whether `timing.csv` is written.
     """
 
     def __init__(self, directory: pathlib.Path, generation: int):
@@ -44,12 +46,12 @@ class Log:
         Raises `DamagedLog` if `metrics.csv` lacks the row of `generation`, and `OSError` if it
         cannot be written.
         """
-        self.directory = directory
-        _sealed.pop(directory / METRICS, None)
-        with _explained():
-            _cut(directory / METRICS, generation)
+        self.metrics, self.timing = directory / METRICS, directory / TIMING
         self.clock, self.elapsed = True, 0.0
-        self.clock = self._spare(f"{TIMING} is no longer written", self._wind, generation)
+        with _explained():
+            kept = _cut(self.metrics, generation)
+        self.size, self.digest = len(kept), hashlib.sha256(kept)
+        self._spare(self._wind, generation)
 
     def append(self, rows: Sequence[Row], seconds: float, elapsed: float):
         """`rows`: one per generation, in order; `seconds` they took together; `elapsed` so far.
@@ -58,89 +60,50 @@ class Log:
         what to do, if `metrics.csv` cannot be written: it then has none of the rows.
         """
         with _explained():
-            _append(self.directory / METRICS, rows)
-        if self.clock:
-            pace = len(rows) / max(seconds, 1e-9)
-            row = dict(zip(CLOCK, [rows[-1]["generation"], elapsed, pace], strict=True))
-            what = f"{TIMING} is no longer written"
-            self.clock = self._spare(what, _append, self.directory / TIMING, [row])
+            data = _append(self.metrics, rows)
+        self.size += len(data)
+        self.digest.update(data)
+        pace = len(rows) / max(seconds, 1e-9)
+        row = dict(zip(CLOCK, [rows[-1]["generation"], elapsed, pace], strict=True))
+        self._spare(_append, self.timing, [row])
 
     def sync(self):
-        """Put the rows on the disk: a checkpoint must never be ahead of them. Raises `OSError`."""
-        if (self.directory / METRICS).exists():
+        """Put the rows on the disk: a checkpoint must never be ahead of them. Raises `OSError`, and
+        `DamagedLog` if the file was shortened or lengthened by somebody else."""
+        if self.size:
             with _explained():
-                files.sync(self.directory / METRICS)
-                files.sync(self.directory)
-        if self.clock and (self.directory / TIMING).exists():
-            what = f"{TIMING} is no longer written"
-            self.clock = self._spare(what, files.sync, self.directory / TIMING)
+                files.sync(self.metrics)
+                files.sync(self.metrics.parent)
+            if os.stat(self.metrics).st_size != self.size:
+                raise DamagedLog(f"{self.metrics} was changed while the run went on: {HELP}")
+        if self.timing.exists():
+            self._spare(files.sync, self.timing)
+
+    def seal(self) -> dict[str, Any]:
+        """Length and SHA-256 of all rows, as they were written, for `verify`; as JSON."""
+        return {"bytes": self.size, "sha256": self.digest.hexdigest()}
 
     def _wind(self, generation: int):
         """Go on with the clock's file, or begin a new one if it is not as we write it."""
-        path = self.directory / TIMING
         try:
-            _cut(path, generation, every=False)
-            seconds = read(path).get("seconds", np.zeros(1))
-            if _header(path) not in (None, CLOCK) or not np.isfinite(seconds).all():
-                raise DamagedLog(f"{path} is not the clock of a run")
+            _cut(self.timing, generation, every=False)
+            seconds = read(self.timing).get("seconds", np.zeros(1))
+            if _header(self.timing) not in (None, CLOCK) or not np.isfinite(seconds).all():
+                raise DamagedLog(f"{self.timing} is not the clock of a run")
             self.elapsed = float(seconds[-1])
         except ValueError as error:
             why = str(error).removesuffix(f"; {HELP}")
             _warn(f"{why}; {TIMING} is begun anew: past times are lost, no result is")
-            files.remove(path)
+            files.remove(self.timing)
 
-    def _spare(self, what: str, action: Callable[..., None], *arguments: Any) -> bool:
-        """Do what training can do without; whether it worked."""
+    def _spare(self, action: Callable[..., Any], *arguments: Any):
+        """Do something to the clock's file, as long as that works: training can do without."""
         try:
-            action(*arguments)
+            if self.clock:
+                action(*arguments)
         except OSError as error:
-            _warn(f"{what}: {error}; training goes on")
-            return False
-        return True
-
-
-# The seal of the rows that a checkpoint stands on.
-
-
-class _Sealed(NamedTuple):
-    file: int  # the inode: a table that was cut is another file
-    generation: int
-    size: int
-    digest: Any
-
-
-_sealed: dict[pathlib.Path, _Sealed] = {}  # so that no byte is hashed twice while a run goes on
-
-
-def seal(directory: pathlib.Path, generation: int) -> dict[str, Any]:
-    """Length and SHA-256 of `metrics.csv` in `directory` up to and with the row of `generation`,
-    as JSON, for `verify`. Of generation 0, which has no row, those of nothing.
-
-    Raises `DamagedLog` if there is no such row.
-    """
-    path = directory / METRICS
-    if generation == 0:
-        return {"bytes": 0, "sha256": hashlib.sha256().hexdigest()}
-    try:
-        descriptor = files.opened(path, os.O_RDONLY, follow=True)
-    except FileNotFoundError:
-        raise _missing(path, generation) from None
-    with open(descriptor, "rb") as file:
-        inode = os.fstat(descriptor).st_ino
-        known = _sealed.get(path)
-        if known is None or known.file != inode or known.generation > generation:
-            known = _Sealed(inode, 0, 0, hashlib.sha256())
-        size, digest, at = known.size, known.digest.copy(), known.generation
-        file.seek(size)
-        while at != generation:
-            line = file.readline()
-            if not line.endswith(b"\n"):
-                raise _missing(path, generation)
-            size += len(line)
-            digest.update(line)
-            at = _generation(line)
-    _sealed[path] = _Sealed(inode, generation, size, digest)
-    return {"bytes": size, "sha256": digest.hexdigest()}
+            _warn(f"{TIMING} is no longer written: {error}; training goes on")
+            self.clock = False
 
 
 def verify(directory: pathlib.Path, seal: dict[str, Any]) -> None:
@@ -149,7 +112,7 @@ def verify(directory: pathlib.Path, seal: dict[str, Any]) -> None:
     path, size = directory / METRICS, seal["bytes"]
     digest, left = hashlib.sha256(), size
     try:
-        with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
+        with files.reading(path) as file:
             while left and (data := file.read(min(left, 2**20))):
                 digest.update(data)
                 left -= len(data)
@@ -170,10 +133,6 @@ def verify(directory: pathlib.Path, seal: dict[str, Any]) -> None:
 
 
 HELP = "restore it from a copy"
-
-
-def _missing(path: pathlib.Path, generation: int) -> DamagedLog:
-    return DamagedLog(f"{path} has no row of generation {generation}, which is done: {HELP}")
 
 
 # Tables.
@@ -207,7 +166,7 @@ def last(path: pathlib.Path) -> dict[str, str]:
     header = _header(path)
     if header is None:
         return {}
-    with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
+    with files.reading(path) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - 2**16))
         whole = file.read().split(b"\n")[1:-1]  # the first may lack its beginning
@@ -231,6 +190,7 @@ def _lines(path: pathlib.Path) -> list[bytes]:
 
 
 def _cells(path: pathlib.Path, line: bytes) -> list[str]:
+    """A line as its cells. Raises `DamagedLog` if it is no text."""
     try:
         return next(csv.reader([line.decode()]), [])
     except (UnicodeDecodeError, csv.Error) as error:
@@ -244,8 +204,9 @@ def _generation(line: bytes) -> int | None:
 
 
 def _header(path: pathlib.Path) -> list[str] | None:
+    """The names of a table's columns; None if it has no whole first line."""
     try:
-        with open(files.opened(path, os.O_RDONLY, follow=True), "rb") as file:
+        with files.reading(path) as file:
             line = file.readline(2**20)
     except FileNotFoundError:
         return None
@@ -257,26 +218,25 @@ def _text(value: float | int) -> str:
     return str(int(value)) if isinstance(value, int | np.integer) else f"{float(value):.9g}"
 
 
-def _line(cells: Sequence[str]) -> str:
-    cells = [f'"{x.replace(chr(34), 2 * chr(34))}"' if set(x) & set(',"\r\n') else x for x in cells]
-    return ",".join(cells) + "\n"
-
-
-def _append(path: pathlib.Path, rows: Sequence[Row]):
-    names = list(rows[0])
-    header = _header(path)
+def _append(path: pathlib.Path, rows: Sequence[Row]) -> bytes:
+    """Write rows behind a table, or as a new one; what was written."""
+    names, header, text = list(rows[0]), _header(path), io.StringIO()
     if header not in (None, names):
         raise ValueError(
             f"a generation has the metrics {', '.join(names)}, but {path} has "
             f"{', '.join(header)}: they must be the same in every generation"
         )
-    lines = [_line([_text(value) for value in row.values()]) for row in rows]
-    files.append(path, "".join(([] if header else [_line(names)]) + lines).encode())
+    table = csv.writer(text, lineterminator="\n")
+    table.writerows([] if header else [names])
+    table.writerows(map(_text, row.values()) for row in rows)
+    data = text.getvalue().encode()
+    files.append(path, data)
+    return data
 
 
-def _cut(path: pathlib.Path, generation: int, *, every: bool = True):
+def _cut(path: pathlib.Path, generation: int, *, every: bool = True) -> bytes:
     """Keep the header and the rows up to `generation`, at which they end if `every` one has a row;
-    what a killed process left behind them goes."""
+    what a killed process left behind them goes. Returns what is kept."""
     lines, kept, at = _lines(path), [], 0
     for line in lines[1:]:
         found = _generation(line)
@@ -285,16 +245,17 @@ def _cut(path: pathlib.Path, generation: int, *, every: bool = True):
         kept.append(line)
         at = found
     if every and at != generation:
-        raise _missing(path, generation)
+        raise DamagedLog(f"{path} has no row of generation {generation}, which is done: {HELP}")
     text = b"".join(line + b"\n" for line in (lines[:1] + kept if kept else []))
     if not text:
         files.remove(path)
-        return
+        return text
     status = os.lstat(path)
-    # A link, or another name of the same file, would be somebody else's.
+    # A link, or another name of the same file, would be another user's.
     ours = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
     if not ours or status.st_size != len(text):
         files.write_whole(path, [text])
+    return text
 
 
 @contextlib.contextmanager

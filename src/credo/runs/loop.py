@@ -29,10 +29,10 @@ from .. import compilation
 from ..compilation import jit
 from ..environments import processes
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
-from ..replay import Replay, shapes_alone
+from ..replay import shapes_alone
 from ..types import NOTHING
-from . import callbacks, checkpoint, config, files, log, record, screen, weights
-from .budget import Budget, fitted, fitted_as
+from . import callbacks, checkpoint, config, files, log, record, screen, segments, weights
+from .budget import Budget, fitted
 from .folder import free_name, new_folder
 from .lock import lock
 from .options import RunOptions
@@ -112,7 +112,7 @@ def train(
     source = None if warm_start is None else Run(warm_start)
     path = pathlib.Path(path) if path else free_name(algorithm, seed)
     with new_folder(path):
-        fit = fitted(algorithm, Budget.read(said["budget"]))
+        fit = fitted(algorithm, Budget(**said["budget"]))
         _begin(path, said, fit, source)
         run = Run(path, trust=True)
         return _train(run, fit, _load(run, fit), options, heard)
@@ -169,7 +169,10 @@ def _said(
     tree = config.to_tree(algorithm)
     config.from_tree(tree)  # what cannot be read back should fail now, not at a resume
     said: dict[str, Any] = {"algorithm": tree, "seed": seed, "options": options.record()}
-    said |= {"budget": Budget.of(algorithm, options).record(), "machine": config.machine()}
+    said |= {
+        "budget": dataclasses.asdict(Budget.of(algorithm, options)),
+        "machine": config.machine(),
+    }
     if warm_start is not None:
         said["warm_start"] = str(warm_start)
     if prompt := config.of_a_prompt(tree):
@@ -197,6 +200,7 @@ def _begin(path: pathlib.Path, said: dict[str, Any], algorithm: Any, source: Run
 
 @jit
 def _initial(algorithm: Any, root: PRNGKeyArray) -> PyTree:
+    """The state of generation 0, in one program."""
     return algorithm.init(key=jax.random.fold_in(root, 0))
 
 
@@ -266,24 +270,24 @@ def _reopened(
     run: Run, options: RunOptions, settings: dict[str, Any], without_replay: bool
 ) -> tuple[Any, checkpoint.Checkpoint]:
     """The algorithm with its new settings, and the checkpoint to go on from. What is changed is put
-    into the record, which is not written yet."""
-    algorithm, old = run.algorithm, Budget.read(run.config["budget"])
-    budget = old.going_on(algorithm, options)
+    into the record, which is not written yet.
+
+    A replay buffer gets the largest of the capacities that its budgets and settings, old and new,
+    ask for: what it holds must fit. Raises `RunError` for a smaller budget, another task, and
+    settings that change what was learned in its shape; `CheckpointError` as `checkpoint.load`.
+    """
+    algorithm, old = run.algorithm, Budget(**run.config["budget"])
+    budget = Budget.of(algorithm, options, old)
     # A smaller budget is refused, but only once it is known how far the run is. A setting may make
     # generations longer: the buffer must hold what either plays.
-    either = (algorithm, config.replaced(algorithm, settings))
-    fit = max(
-        (fitted(one, limit) for one in either for limit in (old, budget)),
-        key=lambda one: getattr(one, "replay_capacity", 0),
-    )
-    fit = fitted_as(algorithm, fit)
+    either, fit = (algorithm, config.replaced(algorithm, settings)), algorithm
+    if hasattr(algorithm, "replay_capacity"):
+        rows = [fitted(one, limit).replay_capacity for one in either for limit in (old, budget)]
+        fit = dataclasses.replace(algorithm, replay_capacity=max(rows))
     with run.found():
         record.check_task(run.config, algorithm.env)
         saved = _load(run, fit, without_replay)
-    try:
-        budget.refuse_smaller(old, saved.generation, int(saved.counters["frames"]))
-    except ValueError as error:
-        raise RunError(f"{run.path}: {error}") from None
+    budget.refuse_smaller(old, saved.generation, int(saved.counters["frames"]), run.path)
     for change in run.config.get("changes", []):  # of an older checkpoint it begins earlier
         change["generation"] = min(change["generation"], saved.generation)
     if settings:
@@ -292,13 +296,15 @@ def _reopened(
     if any(name.startswith("env.") for change in later for name in change.get("set", {})):
         saved = dataclasses.replace(saved, extra=None)  # its score is of another task
     if budget != old:
-        _note(run, saved.generation, budget=old.record())
-        run.config["budget"] = budget.record()
+        _note(run, saved.generation, budget=dataclasses.asdict(old))
+        run.config["budget"] = dataclasses.asdict(budget)
     return fit, saved
 
 
 def _changed(run: Run, fit: Any, settings: dict[str, Any], generation: int) -> Any:
-    """The algorithm with other settings, of the same state, and put into the record."""
+    """The algorithm with other settings, of the same state, and put into the record. Raises
+    `RunError` if any of them changes the shape of the state, and `ConfigError` for what is no
+    setting."""
     new = config.replaced(fit, settings)
     if "replay_capacity" in settings or _shapes(new) != _shapes(fit):
         told = ", ".join(f"{name}={value!r}" for name, value in settings.items())
@@ -328,6 +334,8 @@ def _shapes(algorithm: Any) -> Any:
 
 
 def _warn_of_other_machine(recorded: dict[str, Any]) -> None:
+    """Say under which conditions a run began, if they are others here: bits may differ from then
+    on."""
     here = config.machine()
     # What an older version did not record, a run of that time did not use.
     known = recorded.get("versions", {})
@@ -354,7 +362,7 @@ def _train(
 ) -> Run:
     """From `saved` to the end of the budget. The caller holds the lock."""
     training = _Training(run, algorithm, saved, options, heard)
-    del saved  # its state is donated: nobody may hold the old one
+    del saved  # its state is donated: the old one may not be held
     with Signals(quiet=not options.progress) as signals, training.bar:
         reason = training.go_on(signals)
     if reason == "signal":
@@ -366,7 +374,14 @@ def _train(
 
 
 class _Training:
-    """A run that goes on: where it is, what it writes and who hears of it."""
+    """A run that goes on: where it is, what it writes and who hears of it.
+
+    - `generation`, `frames`: how many are done; `safe`: the generation of the newest checkpoint.
+    - `state`, `best`: donated to every dispatch, so nobody else may hold them.
+    - `reached`: which limit of the budget was reached, in words; `ended`: why else it is to end.
+    - `chunk`: generations that the next dispatch may hold, at most `CHUNK`.
+    - `began`, `last_save`: seconds of the monotonic clock; `before`: seconds of training before.
+    """
 
     def __init__(
         self,
@@ -377,10 +392,8 @@ class _Training:
         heard: list[callbacks.Callback],
     ):
         self.run, self.algorithm, self.options = run, algorithm, options
-        self.root, self.budget = (
-            jax.random.key(run.config["seed"]),
-            Budget.read(run.config["budget"]),
-        )
+        self.root = jax.random.key(run.config["seed"])
+        self.budget = Budget(**run.config["budget"])
         self.generation, self.frames = saved.generation, int(saved.counters["frames"])
         self.safe, self.chunk = saved.generation, 1
         self.journal = log.Log(run.path, self.generation)
@@ -403,8 +416,7 @@ class _Training:
             self.save()
             return "budget"
         self.require_sound()
-        self.bar.say_memory(_buffers(self.state))
-        self.bar.start()
+        self.bar.start([buffer for _, buffer in segments.buffers(self.state)])
         try:
             while not (self.reached or self.ended or signals.received):
                 self.dispatch()
@@ -427,7 +439,11 @@ class _Training:
         return self.ended or "signal"
 
     def dispatch(self) -> None:
-        """Some generations: play, write, tell, and save now and then."""
+        """Some generations: play, write, tell, and save now and then.
+
+        Raises `RunError` if weights are no numbers any more or a task outside JAX failed, and
+        `OSError` or `CheckpointError` if the disk did.
+        """
         tick = time.monotonic()
         rows = self.play()
         self.require_sound()
@@ -477,12 +493,16 @@ class _Training:
         )
 
     def save(self) -> None:
-        """A checkpoint, then the policies: what a policy's file says is never ahead of it."""
+        """A checkpoint, then the policies: what a policy's file says is never ahead of it.
+
+        Rows of metrics are on the disk before, so that a checkpoint is never ahead of them either.
+        Raises `CheckpointError`, `OSError` and `log.DamagedLog`; older checkpoints then stand.
+        """
         self.journal.sync()
         path, generation, sealed = self.run.path, self.generation, seal(self.run.config)
         seals: dict[str, Any] = {"record": sealed}
         if generation > 0:
-            seals["metrics"] = log.seal(path, generation)
+            seals["metrics"] = self.journal.seal()
         checkpoint.save(
             path / "checkpoints",
             generation,
@@ -582,8 +602,3 @@ def advance(fixed: tuple[Any, ...], state: PyTree, best: Best):
     start = (jnp.int32(0), left, dynamic, best, jnp.float32(-jnp.inf), empty)
     count, _, dynamic, best, _, kept = jax.lax.while_loop(ongoing, body, start)
     return eqx.combine(dynamic, static), best, count, kept
-
-
-def _buffers(state: PyTree) -> list[Replay]:
-    leaves = jax.tree.leaves(state, is_leaf=lambda x: isinstance(x, Replay))
-    return [leaf for leaf in leaves if isinstance(leaf, Replay)]

@@ -66,23 +66,16 @@ class Policy:
         return np.asarray(action)
 
 
-def of(run: Any, raw: bool = False, *, best: bool = False) -> Policy:
-    """The champion of a `Run` in its task's units; `raw`: with actions in [-1, 1]; `best`: the
-    best policy in its place."""
-    task = run.config.get("task") if raw else task_of(run)
-    return Policy(champion(run, best=best), task, raw=raw)
-
-
 @float32()
-def champion(run: Any, *, best: bool = False) -> PyTree:
-    """The champion in a run's folder, or the best policy. Where its record tells the task's sizes
-    and its networks are Credo's own, no environment is opened, and nothing of somebody's own is
+def champion(run: Any) -> PyTree:
+    """The policy that a `Run` shows. Where its record tells the task's sizes
+    and its networks are Credo's own, no environment is opened, and no code of others is
     imported."""
     tree, network = run.config["algorithm"], run.part("network")
     if network is None or "task" not in run.config or not tree["class"].startswith("credo."):
-        return run.best if best else run.champion
+        return run.champion
     like = _like(network, tree.get("normalize_observations"), _units(run))
-    return run.restored(like, best=best)
+    return run.restored(like)
 
 
 def _like(network: Any, normalized: bool | None, units: Units) -> PyTree:
@@ -111,7 +104,7 @@ def _units(run: Any) -> Units:
 
 def task_of(run: Any) -> Mapping[str, Any]:
     """What a run's record tells of its task. One of an older Credo tells nothing: a task of others
-    is opened then, and refused if it is somebody's own code and the run is not trusted."""
+    is opened then, and refused if it is code of others and the run is not trusted."""
     if "task" not in run.config:
         return task_record(run.algorithm.env)
     _units(run)

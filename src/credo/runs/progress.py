@@ -7,15 +7,60 @@ from typing import Any
 
 import jax
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
 from ..replay import Replay
 from .budget import Budget, short
 
 
+class Line:
+    """How far something is: a bar on a terminal; where there is none (a log file) a line now and
+    then."""
+
+    def __init__(self, title: str, total: float, done: float, every: float):
+        """`every`: seconds between two lines."""
+        self.title, self.every, self.last = title, every, -every
+        self.console = Console(file=sys.stderr)
+        self.bar = Bar(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=10),
+            TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(),
+            console=self.console,
+            refresh_per_second=1,
+        )
+        self.task = self.bar.add_task(title, total=total, text="", start=False)
+        self.bar.update(self.task, completed=done)
+
+    def start(self, text: str) -> None:
+        """Show the bar. Its clock runs, whatever it waits for: programs that compile, episodes of
+        the first generation."""
+        if self.console.is_terminal:
+            self.bar.start_task(self.task)
+            self.bar.update(self.task, text=text)
+            self.bar.start()
+
+    def stop(self) -> None:
+        """The bar stays as it is."""
+        if self.bar.live.is_started:
+            self.bar.stop()
+
+    def due(self) -> bool:
+        """Whether it is time to say how far it is: a bar is drawn at any time."""
+        return self.console.is_terminal or time.monotonic() - self.last > self.every
+
+    def show(self, text: str, done: float) -> None:
+        """`done` of the total is done; `text` says more."""
+        self.last = time.monotonic()
+        if self.console.is_terminal:
+            self.bar.update(self.task, completed=done, text=text, refresh=True)
+        else:
+            print(f"{self.title}: {text}", file=sys.stderr, flush=True)
+
+
 class Progress:
-    """A bar on a terminal; a line every ten seconds where there is none (a log file)."""
+    """How far a run is, at which pace, and how long it still takes."""
 
     def __init__(
         self, path: pathlib.Path, generation: int, frames: int, budget: Budget, shown: bool = True
@@ -24,51 +69,44 @@ class Progress:
         self.shown, self.path, self.budget = shown, path, budget
         self.generation, self.frames = generation, frames
         self.generation_rate, self.frame_rate, self.updates = 0.0, 0.0, 0  # per second
-        self.console = Console(file=sys.stderr)
-        self.bar = Bar(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=10),
-            TextColumn("{task.fields[text]}"),
-            console=self.console,
-            auto_refresh=False,
-        )
-        share = budget.share(generation, frames)
-        self.task = self.bar.add_task(path.name, total=1.0, text="")
-        self.bar.update(self.task, completed=share)
-        self.last_line = 0.0
+        self.line = Line(path.name, 1.0, budget.share(generation, frames), every=10.0)
 
     def __enter__(self):
         return self
 
+    def __exit__(self, *_):
+        self.line.stop()
+
     def say(self, text: str) -> None:
         """A line that stays."""
         if self.shown:
-            self.console.print(f"[dim]{self.path} {text}[/]", highlight=False, soft_wrap=True)
+            told = f"[dim]{self.path} {text}[/]"
+            self.line.console.print(told, highlight=False, soft_wrap=True)
 
-    def say_memory(self, buffers: list[Replay]) -> None:
-        """How large replay buffers are."""
+    def start(self, buffers: list[Replay]) -> None:
+        """Training begins; replay buffers are told with their sizes."""
         for buffer in buffers:
             size = sum(leaf.nbytes for leaf in jax.tree.leaves(buffer.data))
             self.say(f"has a replay buffer of {buffer.capacity:,} frames, {size / 1e6:,.1f} MB")
-
-    def start(self) -> None:
         # True of a JAX task, whose first generation waits for it, and of any other, whose
         # episodes begin at once.
         self.say("is starting; programs compile when they are first needed, once per machine")
-        if self.shown and self.console.is_terminal:
-            self.bar.start()
+        if self.shown:
+            self.line.start("compiling, then the first generation")
 
-    def update(self, generation: int, row: dict, seconds: float) -> None:
-        """The generations up to this one took `seconds`; `row` holds the metrics of the last."""
+    def update(self, generation: int, row: dict[str, Any], seconds: float) -> None:
+        """The generations up to this one, since the last call, took `seconds`; `row` holds the
+        metrics of the last. Rates are averaged over some five calls, and the first does not count:
+        programs compile in it."""
         frames, seconds = row["frames"], max(seconds, 1e-9)
         rates = (generation - self.generation) / seconds, (frames - self.frames) / seconds
         self.generation, self.frames = generation, frames
-        # The first dispatch compiles: its rate says nothing about the time left.
         first, self.updates = self.updates == 0, self.updates + 1
         old = 0.0 if self.updates <= 2 else 0.8
         self.generation_rate = old * self.generation_rate + (1 - old) * rates[0]
         self.frame_rate = old * self.frame_rate + (1 - old) * rates[1]
-        if not self.shown:
+        share = self.budget.share(generation, frames)
+        if not self.shown or not (self.line.due() or share >= 1):
             return
         best, value = best_of(row)
         text = (
@@ -76,12 +114,7 @@ class Progress:
             f"champion {row['champion_score']:.4g}  {best} {value:.4g}  "
             f"{short(self.frame_rate)} frames/s"
         )
-        share = self.budget.share(generation, frames)
-        if self.console.is_terminal:
-            self.bar.update(self.task, completed=share, text=text, refresh=True)
-        elif time.monotonic() - self.last_line > 10 or share >= 1:
-            self.last_line = time.monotonic()
-            print(f"{self.path.name}: {text}", file=sys.stderr, flush=True)
+        self.line.show(text, share)
 
     def left(self) -> str:
         """Until the first limit of the budget, at the present pace."""
@@ -89,17 +122,8 @@ class Progress:
             (self.budget.generations, self.generation, self.generation_rate),
             (self.budget.frames, self.frames, self.frame_rate),
         )
-        return clock(
-            min(
-                max(limit - done, 0) / max(rate, 1e-9)
-                for limit, done, rate in limits
-                if limit is not None
-            )
-        )
-
-    def __exit__(self, *_):
-        if self.bar.live.is_started:
-            self.bar.stop()
+        left = [max(n - done, 0) / max(pace, 1e-9) for n, done, pace in limits if n is not None]
+        return clock(min(left))
 
 
 def best_of(row: dict[str, Any]) -> tuple[str, float]:

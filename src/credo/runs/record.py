@@ -19,7 +19,7 @@ import json
 import os
 import pathlib
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from . import files, trust
@@ -97,7 +97,7 @@ def _check(record: Record) -> None:
 
 
 def write(folder: pathlib.Path, record: dict[str, Any], *, sign: bool = True) -> None:
-    """Write config.json, with a checksum and, unless somebody else's record was changed, with this
+    """Write config.json, with a checksum and, unless a record of others was changed, with this
     user's signature."""
     said = {k: v for k, v in record.items() if k not in (trust.CHECKSUM, trust.SIGNATURE)}
     if sign and (signature := trust.sign(said)):
@@ -134,32 +134,34 @@ def task_of(env: Any) -> dict[str, Any]:
         folder = os.fsencode(os.getcwd()).decode(errors="replace")
     except OSError:  # it was removed
         folder = None
-    sizes: dict[str, Any] = {name: getattr(env, name, None) for name in SIZES}
-    sizes |= {"discrete": bool(getattr(env, "discrete", False))}
-    return sizes | {"actions": None, "observations": None} | (told or {}) | {"folder": folder}
+    return _sizes(env) | {"actions": None, "observations": None} | (told or {}) | {"folder": folder}
 
 
 def check_task(record: Mapping[str, Any], env: Any) -> None:
     """Raise `RunError` if a task is not the one that a run began with: `env` has other sizes than
     were recorded. It opens a task outside JAX."""
-    recorded, name = record.get("task", {}), task_name(env)
-    for size, what in SIZES.items():
-        if size not in recorded:
+    recorded, today = record.get("task", {}), _sizes(env)
+    for name, now in today.items():
+        then = recorded.get(name, now)
+        if then == now:
             continue
-        then, now = recorded[size], getattr(env, size, None)
-        if then != now:
-            raise RunError(
-                f"{name} has {_count(now)} {what} today and {_count(then)} when this run began: "
-                "give it back what it had, or start a new run"
-            )
-    if "discrete" in recorded and recorded["discrete"] != bool(getattr(env, "discrete", False)):
-        kinds = {False: "Box", True: "Discrete"}
-        then, now = kinds[bool(recorded["discrete"])], kinds[not recorded["discrete"]]
-        raise RunError(f"{name} has {now} actions today and {then} ones when this run began")
+        if name == "discrete":
+            kinds = [("Discrete" if discrete else "Box") for discrete in (now, then)]
+            told = f"{kinds[0]} actions today and {kinds[1]} ones when this run began"
+        else:
+            counts = ["no" if size is None else size for size in (now, then)]
+            told = f"{counts[0]} {SIZES[name]} today and {counts[1]} when this run began"
+        raise RunError(f"{task_name(env)} has {told}: give it back what it had, or start a new run")
+
+
+def _sizes(env: Any) -> dict[str, Any]:
+    """Those of a task today; None for those that it has not. It opens a task outside JAX."""
+    sizes: dict[str, Any] = {name: getattr(env, name, None) for name in SIZES}
+    return sizes | {"discrete": bool(getattr(env, "discrete", False))}
 
 
 def task_name(env: Any) -> str:
-    """What people call a task: its id, or its class."""
+    """What people call a task: its id, or its class. Of a wrapper, that of the task inside."""
     while getattr(env, "id", None) is None and getattr(env, "env", None) is not None:
         env = env.env
     return getattr(env, "id", None) or type(env).__name__
@@ -172,11 +174,8 @@ def home(record: Mapping[str, Any]) -> str:
     return f". It began in {folder}: start credo there" if folder not in (None, here) else ""
 
 
-def _count(size: int | None) -> str:
-    return "no" if size is None else str(size)
-
-
 def _checksum(content: dict[str, Any]) -> str:
+    """The short hash of all other fields."""
     return trust.short({k: v for k, v in content.items() if k != trust.CHECKSUM})
 
 
@@ -187,73 +186,66 @@ def _brief(value: Any) -> str:
 
 # What each field must be.
 
-Test = Callable[[Any], bool]
+
+def _whole(value: Any, least: int = 0, most: int = 2**63 - 1) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
 
 
-def _is(*kinds: type) -> Test:
-    return lambda value: isinstance(value, kinds) and (bool in kinds or not isinstance(value, bool))
+def _is_object(value: Any) -> bool:
+    """Whether this may be an object's tree: nothing is looked up before its class has a proper
+    name."""
+    return isinstance(value, dict) and CLASS.fullmatch(str(value.get("class"))) is not None
 
 
-def _whole(least: int, most: int = 2**63 - 1) -> Test:
-    return lambda value: _is(int)(value) and least <= value <= most
-
-
-def _maybe(test: Test) -> Test:
-    return lambda value: value is None or test(value)
-
-
-def _has(needed: Iterable[str] = (), /, **tests: Test) -> Test:
-    """An object with the needed entries; each that is tested passes, where it is there."""
-    return lambda value: (
-        isinstance(value, dict)
-        and set(needed) <= set(value)
-        and all(test(value[name]) for name, test in tests.items() if name in value)
-    )
-
-
-def _object(**tests: Test) -> Test:
-    named: dict[str, Test] = {"class": lambda value: CLASS.fullmatch(str(value)) is not None}
-    return _has(("class", *tests), **named, **tests)
+def _is_algorithm(value: Any) -> bool:
+    return _is_object(value) and _is_object(value.get("env"))
 
 
 def _is_budget(value: Any) -> bool:
-    limits: dict[str, Test] = {"generations": _maybe(_whole(1)), "frames": _maybe(_whole(1))}
-    right = _has(**limits, stop_at=_maybe(_is(int, float)))(value)
-    known = right and not set(value) - {*limits, "stop_at"}
-    return known and any(value.get(name) is not None for name in limits)
+    """At least one whole limit, and nothing that is none of a budget's fields."""
+    if not (isinstance(value, dict) and value.keys() <= {"generations", "frames", "stop_at"}):
+        return False
+    limits = [value[k] for k in ("generations", "frames") if value.get(k) is not None]
+    score = isinstance(value.get("stop_at"), int | float | None)
+    return score and limits != [] and all(_whole(limit, 1) for limit in limits)
 
 
-SIZE, TEXT = _maybe(_whole(0, 2**31)), _is(str)
-MACHINE: dict[str, Test] = {
-    "versions": lambda value: isinstance(value, dict) and all(map(TEXT, value.values())),
-    "cores": _whole(0, 2**31),
-    **dict.fromkeys(("processor", "device", "system"), TEXT),
-}
-CHANGE = _has(("generation",), generation=_whole(0))
+def _is_machine(value: Any) -> bool:
+    """Older records lack some of it."""
+    if not (isinstance(value, dict) and isinstance(value.get("versions", {}), dict)):
+        return False
+    named = [value.get(name, "") for name in ("processor", "device", "system")]
+    texts = [*named, *value.get("versions", {}).values()]
+    return _whole(value.get("cores", 0)) and all(isinstance(text, str) for text in texts)
+
+
+def _is_task(value: Any) -> bool:
+    if not (isinstance(value, dict) and isinstance(value.get("folder"), str | None)):
+        return False
+    return all(value.get(name) is None or _whole(value[name], 0, 2**31) for name in SIZES)
 
 
 def _is_changes(value: Any) -> bool:
-    return isinstance(value, list) and all(map(CHANGE, value))
+    return isinstance(value, list) and all(
+        isinstance(change, dict) and _whole(change.get("generation")) for change in value
+    )
 
 
 def _is_hash(value: Any) -> bool:
     return isinstance(value, str) and re.fullmatch("[0-9a-f]+", value) is not None
 
 
-FIELDS: dict[str, tuple[Test, str]] = {
-    "algorithm": (_object(env=_object()), 'an object with "class" and "env"'),
+FIELDS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "algorithm": (_is_algorithm, 'an object with "class" and "env"'),
     # Older versions took seeds that JAX cuts to 32 bits.
-    "seed": (_whole(-(2**63)), "a whole number"),
+    "seed": (lambda value: _whole(value, -(2**63)), "a whole number"),
     "budget": (_is_budget, "generations and frames, whole numbers of at least 1, and stop_at"),
-    "options": (_has(), "an object"),
-    "machine": (_has(**MACHINE), "versions, processor, cores, device and system"),
-    "task": (
-        _has(**dict.fromkeys(SIZES, SIZE), folder=_maybe(TEXT)),
-        "the sizes of the task and the folder it was found from",
-    ),
-    "warm_start": (TEXT, "the path of a run"),
+    "options": (lambda value: isinstance(value, dict), "an object"),
+    "machine": (_is_machine, "versions, processor, cores, device and system"),
+    "task": (_is_task, "the sizes of the task and the folder it was found from"),
+    "warm_start": (lambda value: isinstance(value, str), "the path of a run"),
     "changes": (_is_changes, "a list of objects, each with a generation"),
-    "resumable": (_is(bool), "true or false"),
+    "resumable": (lambda value: isinstance(value, bool), "true or false"),
     trust.CHECKSUM: (_is_hash, "a number in hexadecimal digits"),
     trust.SIGNATURE: (_is_hash, "a number in hexadecimal digits"),
 }

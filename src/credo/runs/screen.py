@@ -12,16 +12,17 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-GONE = (errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO)  # nobody will ever read again
+GONE = (errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO)  # it will never be read again
 
 
 class Stream:
-    """A text stream that is written to as long as somebody reads it, and never raises."""
+    """A text stream that is written to as long as it is read, and never raises."""
 
     def __init__(self, inner: Any):
         self._inner = inner  # None where the process was started without one
 
     def write(self, text: str) -> int:
+        """Never raises for want of a reader; characters that the stream has not are escaped."""
         with _unread(self._inner):
             try:
                 self._inner.write(text)
@@ -61,15 +62,15 @@ def calm() -> Iterator[None]:
     try:
         yield
     finally:
-        if sys.stdout is now[0]:  # or somebody else's, who will put back what was there
+        if sys.stdout is now[0]:  # or that of others, who will put back what was there
             sys.stdout = before[0]
         if sys.stderr is now[1]:
             sys.stderr = before[1]
 
 
-def say(text: str, *, to: str = "stderr") -> None:
-    """A line on stderr or stdout, if anybody is there to read it."""
-    stream = Stream(getattr(sys, to))
+def say(text: str) -> None:
+    """A line on stderr, if anybody is there to read it."""
+    stream = Stream(sys.stderr)
     stream.write(text + "\n")
     stream.flush()
 
@@ -85,7 +86,7 @@ def occupy() -> None:
 
 @contextlib.contextmanager
 def _unread(stream: Any) -> Iterator[None]:
-    """What is said to nobody goes to nobody from now on, also what is left in a buffer."""
+    """What is not read goes nowhere from now on, also what is left in a buffer."""
     try:
         yield
     except AttributeError:

@@ -20,7 +20,7 @@ changed in any other way than by appending costs time, never rows.
 import json
 import re
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,6 +69,7 @@ class Rows(NamedTuple):
             at += n
 
     def _on_host(self, first: int, last: int) -> np.ndarray:
+        """Rows `first` to `last` of the ring as NumPy."""
         if isinstance(self.leaf, np.ndarray) or _is_on_cpu(self.leaf):
             return np.asarray(self.leaf)[first:last]  # a view: no copy
         at = min(first, self.leaf.shape[0] - self.block)
@@ -77,7 +78,8 @@ class Rows(NamedTuple):
 
 
 class Ring(NamedTuple):
-    """The leaves of one replay buffer by their path in the tree, and the rows it holds."""
+    """The leaves of one replay buffer by their path in the tree, `[capacity, ...]` each, and the
+    rows it holds: from number `oldest` up to `written`, the next one to be written."""
 
     leaves: dict[str, Any]
     oldest: int
@@ -105,7 +107,8 @@ class Ring(NamedTuple):
 
 
 class Stored(NamedTuple):
-    """One leaf of a buffer on disk."""
+    """One leaf of a buffer on disk: its whole `shape`, and of each part the first row, the one
+    behind the last, and the file. Nothing is read before `read`."""
 
     name: str
     dtype: np.dtype
@@ -151,14 +154,18 @@ class Stored(NamedTuple):
         return whole
 
 
+def buffers(tree: PyTree) -> list[tuple[tuple[Any, ...], Replay]]:
+    """All replay buffers in `tree`, each behind its path."""
+    nodes = tree_flatten_with_path(tree, is_leaf=lambda node: isinstance(node, Replay))[0]
+    return [(path, node) for path, node in nodes if isinstance(node, Replay)]
+
+
 def names(tree: PyTree) -> set[str]:
     """The paths of all numbers of all replay buffers in `tree`."""
-    nodes = tree_flatten_with_path(tree, is_leaf=lambda node: isinstance(node, Replay))[0]
     return {
         keystr((*path, *at))
-        for path, node in nodes
-        if isinstance(node, Replay)
-        for at, leaf in tree_flatten_with_path(node)[0]
+        for path, buffer in buffers(tree)
+        for at, leaf in tree_flatten_with_path(buffer)[0]
         if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
     }
 
@@ -169,8 +176,7 @@ def rings(tree: PyTree) -> list[Ring]:
     Those others are stacked ones (of several seeds, say), and those with bits set in rows that
     were never written.
     """
-    nodes = tree_flatten_with_path(tree, is_leaf=lambda node: isinstance(node, Replay))[0]
-    found = [_ring(path, node) for path, node in nodes if isinstance(node, Replay)]
+    found = (_ring(path, buffer) for path, buffer in buffers(tree))
     return [ring for ring in found if ring is not None]
 
 
@@ -193,9 +199,10 @@ def describe(rings: list[Ring]) -> str:
     )
 
 
-def stored(folder: Path, description: str) -> dict[str, Stored]:
-    """The leaves of all buffers in the checkpoint `folder`, by name."""
-    files = [(match, folder / match[0]) for match in map(NAME.fullmatch, _listed(folder)) if match]
+def stored(folder: Path, names: Iterable[str], description: str) -> dict[str, Stored]:
+    """The leaves of all buffers in the checkpoint `folder`, whose files have these `names`, by
+    name."""
+    files = [(match, folder / match[0]) for match in map(NAME.fullmatch, names) if match]
     found = {}
     for index, leaves in enumerate(json.loads(description)):
         held = [(int(m[2]), int(m[3]), path) for m, path in files if int(m[1]) == index]
@@ -205,6 +212,8 @@ def stored(folder: Path, description: str) -> dict[str, Stored]:
 
 
 def _ring(path: tuple[Any, ...], replay: Replay) -> Ring | None:
+    """A buffer as one that can be cut: unstacked, without keys, and zero where nothing was
+    written."""
     data = tree_flatten_with_path(replay.data)[0]
     leaves = {keystr((*path, GetAttrKey("data"), *at)): leaf for at, leaf in data}
     capacities = {leaf.shape[:1] for leaf in leaves.values()}
@@ -218,6 +227,7 @@ def _ring(path: tuple[Any, ...], replay: Replay) -> Ring | None:
 
 
 def _file_name(index: int, rows: Mapping[str, Rows]) -> str:
+    """That of a part: number of the buffer, range of rows, and the CRC-32 of leaves and rows."""
     crc = 0
     for name, part in rows.items():
         crc = zlib.crc32(f"{name} {part.dtype}{list(part.shape)}".encode(), crc)
@@ -225,10 +235,6 @@ def _file_name(index: int, rows: Mapping[str, Rows]) -> str:
             crc = zlib.crc32(piece, crc)
     part = next(iter(rows.values()))
     return f"replay{index}-{part.start:012d}-{part.stop:012d}-{crc:08x}.safetensors"
-
-
-def _listed(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
 
 
 def _is_on_cpu(leaf: jax.Array) -> bool:

@@ -30,7 +30,7 @@ class Signals:
     """Ctrl-C, SIGTERM and SIGHUP ask for an end after the generation; a second one stops at once.
 
     Python handles a signal between two steps of its own, which may never come: a program that
-    runs, a pipe that nobody writes to. So a thread hears of it too, and if the second one does not
+    runs, a pipe that is not written to. So a thread hears of it too, and if the second one does not
     stop the process in `GRACE` seconds, it ends it. A hang-up that is ignored (`nohup`) stays so.
 
     `end`: called before that, to end child processes.
@@ -43,6 +43,7 @@ class Signals:
         self._left = threading.Event()
 
     def __enter__(self):
+        """Hear signals, in the main thread alone; another one gets none."""
         if threading.current_thread() is threading.main_thread():
             for number in NUMBERS:
                 if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
@@ -52,6 +53,7 @@ class Signals:
         return self
 
     def _receive(self, number, frame):
+        """Python's handler: note the first signal, end at the second one."""
         if self.received:
             raise SystemExit(128 + number)
         self.received = number
@@ -62,14 +64,17 @@ class Signals:
                 os.write(2, b"\ncredo: stopping after this generation; once more to stop at once\n")
 
     def _listen(self) -> None:
+        """Have the system write the number of every signal into a pipe, for `_watch`."""
         read, self._write = os.pipe()
         os.set_blocking(self._write, False)
         self._old = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
         threading.Thread(target=self._watch, args=(read,), daemon=True).start()
 
     def _watch(self, read: int) -> None:
+        """In a thread: end the process if `GRACE` seconds after a second signal it is still
+        there."""
         seen = 0
-        while data := os.read(read, 64):  # empty once nobody can write any more
+        while data := os.read(read, 64):  # empty once no process can write any more
             for number in data:
                 seen += number in self._before
                 if number in self._before and seen == 2 and not self._left.wait(GRACE):
@@ -79,6 +84,7 @@ class Signals:
         os.close(read)
 
     def __exit__(self, *_):
+        """What was in place before hears them again."""
         self._left.set()
         if self._before:
             for number, handler in self._before.items():

@@ -1,6 +1,7 @@
 """A run on disk: what it says of itself, its metrics, and its policies."""
 
 import contextlib
+import copy
 import json
 import pathlib
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from jaxtyping import PyTree
 from .. import compilation
 from ..environments.host import EnvironmentFailure
 from ..replay import shapes_alone
-from . import checkpoint, config, files, log, policy, record
+from . import checkpoint, config, log, policy, record
 from .policy import Policy
 from .progress import best_of
 from .record import RunError
@@ -24,10 +25,14 @@ CHAMPION, BEST = "champion.safetensors", "best.safetensors"
 
 
 class Run:
-    """A run on disk, finished or not. Reading it changes nothing."""
+    """A run on disk, finished or not. Reading it changes nothing.
+
+    `path`: its folder. `config`: its record (see `record`), checked and whole. `trusted`: whether
+    code of somebody's own that it names may be imported.
+    """
 
     def __init__(self, path: str | pathlib.Path, *, trust: bool = False, best: bool = False):
-        """`trust`: whether classes and environments of somebody's own may be imported that a run
+        """`trust`: whether classes and environments of others may be imported that a run
         names which this user did not make. `best`: show the best policy wherever the champion is
         meant. Raises `RunError`."""
         self.path, self._shown = pathlib.Path(path), BEST if best else CHAMPION
@@ -43,7 +48,7 @@ class Run:
 
     def part(self, name: str) -> Any:
         """A field of the recorded algorithm as an object (its `env`, `network`, `learners`), made
-        of Credo's own classes; None if somebody's own code would have to be imported for it. It
+        of Credo's own classes; None if code of others would have to be imported for it. It
         opens no environment."""
         try:
             return config.from_tree(self.config["algorithm"].get(name), trust=False)
@@ -72,35 +77,45 @@ class Run:
         )
 
     @property
+    @compilation.float32()
     def champion(self) -> PyTree:
         """The policy with the highest fitness of the last generation; of a learner alone, its
         actor. Raises `RunError` if it is another run's, or if the task has other sizes today."""
-        return self._opened(self._shown)
+        algorithm = self.algorithm
+        with self.found(), shapes_alone():
+            record.check_task(self.config, algorithm.env)
+            like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0)).champion
+        return self.restored(like)
 
     @property
     def best(self) -> PyTree:
         """The champion with the highest test score of all generations; of equal ones the first.
         Its score is that of one test, so it flatters: evaluate it on fresh episodes. Raises as
         `champion` does, and `RunError` if there is none yet."""
-        return self._opened(BEST)
+        return self._showing_best().champion
 
     @property
     def best_test(self) -> tuple[int, float]:
         """The generation of the best policy, and its score in that generation's test."""
-        metadata = self._metadata(BEST)
+        metadata = self._showing_best()._metadata()
         return int(metadata["generation"]), float(metadata["score"])
 
-    def restored(self, like: PyTree, *, best: bool = False) -> PyTree:
-        """The champion, or the best policy, of which `like` has the structure. Raises as `champion`
-        does."""
-        name = BEST if best else self._shown
-        self._metadata(name)
-        return checkpoint.import_policy(self.path / name, like)
+    def _showing_best(self) -> "Run":
+        run = copy.copy(self)
+        run._shown = BEST
+        return run
+
+    def restored(self, like: PyTree) -> PyTree:
+        """The champion, of which `like` has the structure. Raises as `champion` does."""
+        self._metadata()
+        return checkpoint.import_policy(self.path / self._shown, like)
 
     def policy(self, raw: bool = False, *, best: bool = False) -> Policy:
         """The champion as a plain callable, in the task's own units; `raw`: in [-1, 1]; `best`: the
         best policy in its place."""
-        return policy.of(self, raw, best=best)
+        run = self._showing_best() if best else self
+        task = run.config.get("task") if raw else policy.task_of(run)
+        return Policy(policy.champion(run), task, raw=raw)
 
     @property
     def advice(self) -> str:
@@ -128,18 +143,10 @@ class Run:
             return str(error)
         return None
 
-    @compilation.float32()
-    def _opened(self, name: str) -> PyTree:
-        algorithm = self.algorithm
-        with self.found(), shapes_alone():
-            record.check_task(self.config, algorithm.env)
-            like = eqx.filter_eval_shape(algorithm.init, key=jax.random.key(0)).champion
-        return self.restored(like, best=name == BEST)
-
-    def _metadata(self, name: str) -> dict[str, str]:
+    def _metadata(self) -> dict[str, str]:
         """What a policy's file says of itself. Raises `RunError` if it is another run's."""
-        path = self.path / name
-        if name == BEST and not path.exists():
+        path = self.path / self._shown
+        if self._shown == BEST and not path.exists():
             raise RunError(
                 f"{path} is not there: no policy was tested since this run began to keep it"
             )
@@ -148,7 +155,7 @@ class Run:
             before = _json(metadata.get("algorithm"))
             lines = config.differences(before, self.config["algorithm"])
             told = f" ({'; '.join(lines[:3])})" if lines else ""
-            what = "champion" if name == CHAMPION else "best policy"
+            what = "champion" if self._shown == CHAMPION else "best policy"
             raise RunError(
                 f"{path} is not this run's {what}: {why}{told}; {self.advice} writes it again, or "
                 "restore it from a copy"
@@ -158,15 +165,13 @@ class Run:
     def _verify_metrics(self) -> None:
         """Raise `RunError` if metrics.csv is not what the newest intact checkpoint says it was."""
         for folder in sorted((self.path / "checkpoints").glob("[0-9]*"), reverse=True):
-            try:
-                seals = json.loads(files.read_bytes(folder / checkpoint.COMMIT))["seals"]
-                sealed = seals["metrics"]
-            except (OSError, ValueError, KeyError, TypeError):
+            seals = checkpoint.seals_of(folder)
+            if "metrics" not in seals:
                 continue  # damaged, or written by an older version
-            why = self.differs(sealed)
+            why = self.differs(seals["metrics"])
             if why is None:
                 return
-            ours = record.stranger(self.config, seals["record"]) is None
+            ours = record.stranger(self.config, seals.get("record")) is None
             if ours and checkpoint.damage(folder) is None:
                 raise RunError(
                     f"{why}; `credo resume` goes on from the newest checkpoint it agrees with"

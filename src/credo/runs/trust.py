@@ -1,6 +1,6 @@
 """Who made a run: records signed with a key of the user's own, and short hashes of what they say.
 
-A run's config.json can name classes of somebody's own, and to import a module is to execute it. A
+A run's config.json can name classes of others, and to import a module is to execute it. A
 record that this user's Credo wrote is signed with a key in the user's own folder, so that such a
 run goes on without a word; one from elsewhere must be trusted first. Nothing random enters what a
 run computes: champions and checkpoints hold hashes alone.
@@ -64,7 +64,7 @@ def key_path() -> pathlib.Path | None:
         return pathlib.Path(base) / "credo" / "key"
     try:
         home = pathlib.Path.home()
-    except RuntimeError:  # no HOME, and nobody knows this user
+    except RuntimeError:  # no HOME, and this user is unknown
         return None
     return home / ".config" / "credo" / "key" if home.is_absolute() else None
 
@@ -75,22 +75,30 @@ def _code(record: Mapping[str, Any], key: bytes) -> str:
 
 
 def _key(*, make: bool) -> bytes | None:
+    """This user's key, made if there is none and it is to be; None, with a warning if it was to be
+    made, if there can be none."""
     path = key_path()
-    if path is None:
-        return _none("this user has no home folder") if make else None
     try:
+        if path is None:
+            raise ValueError("this user has no home folder")
         if make and not path.exists():
             _make(path)
         return _read(path)
     except (OSError, ValueError) as error:
-        return _none(str(error)) if make else None
+        if make:
+            warnings.warn(
+                f"runs made now are not signed, since there is no key for it ({error}): those with "
+                "classes of your own will go on only with --trust",
+                stacklevel=3,
+            )
+        return None
 
 
 def _read(path: pathlib.Path) -> bytes:
-    """The key, if it is nobody else's to know or to choose."""
+    """The key, if no other user can know or choose it."""
     status = os.stat(path)
     if hasattr(os, "geteuid") and status.st_uid != os.geteuid():
-        raise ValueError(f"{path} belongs to somebody else")
+        raise ValueError(f"{path} belongs to another user")
     if status.st_mode & 0o077:
         raise ValueError(f"{path} can be read or written by others: `chmod 600 {path}`")
     key = files.read_bytes(path, most=SIZE)
@@ -118,11 +126,3 @@ def _make(path: pathlib.Path) -> None:
             os.replace(draft, path)
     finally:
         files.remove(draft)
-
-
-def _none(why: str) -> None:
-    warnings.warn(
-        f"runs made now are not signed, since there is no key for it ({why}): those with classes "
-        "of your own will go on only with --trust",
-        stacklevel=2,
-    )

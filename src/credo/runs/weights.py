@@ -18,7 +18,7 @@ PARTS = ("champion", "learner", "learners", "actor", "critic", "optimizer")
 
 def broken(state: PyTree) -> str | None:
     """The weights that are not finite, in words; None if all are. Metrics may be NaN, weights
-    not."""
+    not. One program for each structure of a state, and one transfer from the device."""
     kept = {part: getattr(state, part) for part in PARTS if hasattr(state, part)}
     kept = eqx.filter(kept, eqx.is_inexact_array)
     sound = np.asarray(_finite(kept))

@@ -1,29 +1,26 @@
 /* Legends that toggle curves, and tooltips. A page without this script shows everything but the
    tooltips. */
 (() => {
-  const nearest = (xs, x, log) => {
-    const far = at => log ? Math.abs(Math.log(at / x)) : Math.abs(at - x);
-    return xs.reduce((best, at, i) => far(at) < far(xs[best]) ? i : best, 0);
-  };
+  const nearest = (xs, x) =>
+    xs.reduce((best, at, i) => Math.abs(at - x) < Math.abs(xs[best] - x) ? i : best, 0);
 
   /* Lines of a tooltip: [colour or null, text], and where its guide stands, as a share of the
      axes' width. `u` and `v`: where the pointer is, from the left and from the top. */
   function ofCurves(tips, buttons, u) {
-    const [low, high] = tips.log ? tips.x.map(Math.log) : tips.x;
-    const raw = low + u * (high - low), x = tips.log ? Math.exp(raw) : raw;
+    const [low, high] = tips.x, x = low + u * (high - low);
     const lines = [];
     let at = null;
     tips.curves.forEach((curve, i) => {
       const button = buttons.find(button => button.dataset.curve === String(i));
       if (button && button.getAttribute('aria-pressed') === 'false') return;
-      const k = nearest(curve.x, x, tips.log);
+      const k = nearest(curve.x, x);
       at ??= curve.x[k];
       const color = button ? getComputedStyle(button.querySelector('path')).stroke : null;
       if (curve.text[k]) lines.push([color, `${button ? button.textContent : ''} ${curve.text[k]}`]);
     });
     if (at === null) return null;
     const number = at.toLocaleString('en', {maximumSignificantDigits: 6});
-    const share = ((tips.log ? Math.log(at) : at) - low) / (high - low);
+    const share = (at - low) / (high - low);
     return {lines: [[null, `${tips.name} ${number}`], ...lines], share};
   }
 

@@ -104,7 +104,7 @@ function drawPoi(j, t, pixel) {
   set(dot, 'class', 'dot' + seen);
   set(dot, 'transform', `translate(${x} ${-y}) scale(${pixel})`);
   const since = game.observed.findIndex(row => row[j]);
-  /* Among many POIs, labels of those where somebody is. */
+  /* Among many POIs, labels of those where a rover is. */
   if (game.poi.length > 20 && (seen || !inside)) label.textContent = '';
   else label.textContent = seen ? `\u2713 step ${since}` : `${inside} of ${n}`;
   set(label, 'class', seen.trim());
