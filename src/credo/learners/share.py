@@ -1,0 +1,77 @@
+"""Who gets the frames: what part of a hybrid's experience its learners collect, and what part its
+population.
+
+A generation of the population has a fixed number of episodes. The learners then play and learn, one
+round of episodes after the other, until they have had their share of all frames.
+"""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .. import require
+
+
+class AbstractShare(eqx.Module):
+    """The learners' share of all frames, from generation to generation."""
+
+    @property
+    @abc.abstractmethod
+    def most(self) -> float:
+        """No share is larger, below 1."""
+
+    @abc.abstractmethod
+    def first(self) -> float:
+        """The share in the first generation."""
+
+    @abc.abstractmethod
+    def after(
+        self, share: Float[Array, ""], fitness: Float[Array, " pop"], guests: Bool[Array, " pop"]
+    ) -> Float[Array, ""]:
+        """The next share, once a population has a `fitness` (of numbers) in which `guests` are
+        actors of learners that joined it just before."""
+
+
+class Fixed(AbstractShare):
+    """The same share in every generation."""
+
+    learners: float = eqx.field(static=True, default=0.5)  # of all frames, in [0, 1)
+
+    def __check_init__(self):
+        require.within("learners", self.learners, 0, 0.99)
+
+    @property
+    def most(self) -> float:
+        return self.learners
+
+    def first(self) -> float:
+        return self.learners
+
+    def after(self, share, fitness, guests):
+        return share
+
+
+class Earned(AbstractShare):
+    """As many frames as the learners' actors have earned: their share follows the part of the
+    population that they beat on the day they join it."""
+
+    least: float = eqx.field(static=True, default=0.1)  # no share is smaller, in [0, most]
+    most: float = eqx.field(static=True, default=0.9)  # no share is larger, in [least, 1)
+    memory: float = 0.2  # weight of the newest generation, in (0, 1]
+
+    def __check_init__(self):
+        require.within("most", self.most, 0, 0.99)
+        require.within("least", self.least, 0, self.most)
+        require.within("memory", self.memory, 0, 1)
+
+    def first(self) -> float:
+        return 0.5 * (self.least + self.most)
+
+    def after(self, share, fitness, guests):
+        beaten = (fitness[:, None] > fitness[None]) & guests[:, None] & ~guests[None]
+        pairs = jnp.sum(guests) * jnp.sum(~guests)
+        part = jnp.sum(beaten).astype(jnp.float32) / jnp.maximum(pairs, 1).astype(jnp.float32)
+        aim = self.least + (self.most - self.least) * part
+        return jnp.where(pairs > 0, share + self.memory * (aim - share), share)
