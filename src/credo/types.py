@@ -77,26 +77,19 @@ class Transition(eqx.Module):
     active: Bool[Array, "*rows agents"] | None = None  # whose action counted; None: everybody's
 
     def followed(self, later: "Transition", where: Any, discount: Any) -> "Transition":
-        """Up to the end of a `later` transition, whose rewards are added with a `discount`, in those
-        rows `where` there is one."""
+        """Up to the end of a `later` transition, whose rewards are added with a `discount`, in
+        those rows `where` there is one."""
         rewards = {
             name: x + jnp.where(where, discount * later.rewards[name], 0.0)
             for name, x in self.rewards.items()
         }
-        ends = [
-            jnp.where(_behind(where, new), new, old)
-            for new, old in (
-                (later.next_obs, self.next_obs),
-                (later.terminated, self.terminated),
-                (later.truncated, self.truncated),
-            )
-        ]
-        return Transition(self.obs, self.action, rewards, *ends, self.active)
 
+        def last(new: Any, old: Any) -> Any:
+            return jnp.where(where.reshape(where.shape + (1,) * (new.ndim - where.ndim)), new, old)
 
-def _behind(where: Any, x: Any) -> Any:
-    """`where` for `x`, which may have an axis more."""
-    return where.reshape(where.shape + (1,) * (x.ndim - where.ndim))
+        next_obs = last(later.next_obs, self.next_obs)
+        ends = (last(later.terminated, self.terminated), last(later.truncated, self.truncated))
+        return Transition(self.obs, self.action, rewards, next_obs, *ends, self.active)
 
 
 class Batch(eqx.Module):

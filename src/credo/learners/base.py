@@ -121,7 +121,9 @@ def bellman(
 ) -> Float[Array, "samples batch *agents"]:
     """Reward and discounted value of the next state: what returns are worth of which `after` is a
     sample there, unless the episode `ended`."""
-    reward = (learner.reward_scale * batch.reward)[None]
+    scale = learner.reward_scale
+    assert scale is not None, "`learn` puts a number in place of None"
+    reward = (scale * batch.reward)[None]
     discount = learner.gamma if batch.discount is None else batch.discount[None]
     return reward + discount * jnp.where(ended[None], 0.0, after)
 

@@ -155,7 +155,7 @@ class SAC(AbstractLearner):
         obs = batch.next_obs.T
         action, log_p = state.actor.sample(obs, key=key)
         atoms = jnp.stack([critic.atoms(obs, action) for critic in state.target_critics])
-        soft = self.critic.values.cautious(atoms) - alpha * log_p[None]
+        soft = state.target_critics[0].values.cautious(atoms) - alpha * log_p[None]
         return bellman(self, batch, soft, batch.terminated)
 
     def actor(self, state: SACState) -> AbstractPolicy:

@@ -149,7 +149,7 @@ class TD3(AbstractLearner):
         pair = (features_first(batch.next_obs), features_first(action))
         atoms = jnp.stack([critic.atoms(*pair) for critic in state.target_critics])
         ended = batch.terminated | (batch.truncated & (not self.bootstrap_truncated))
-        return bellman(self, batch, self.critic.values.cautious(atoms), ended)
+        return bellman(self, batch, state.target_critics[0].values.cautious(atoms), ended)
 
     def actor(self, state: TD3State) -> AbstractPolicy:
         return state.actor

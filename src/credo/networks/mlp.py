@@ -90,7 +90,6 @@ class AbstractCritic(eqx.Module):
 
     joint: ClassVar[bool] = False
     """Whether it sees the whole team; `init` then takes the number of agents behind the sizes."""
-    values: eqx.AbstractVar[AbstractValues]  # what its outputs say of the return
 
     @abc.abstractmethod
     def init(
@@ -103,7 +102,11 @@ class AbstractCriticNetwork(eqx.Module):
     """What `AbstractCritic.init` makes: weights, and how they value state and action."""
 
     action_size: eqx.AbstractVar[int]
-    values: eqx.AbstractVar[AbstractValues]
+
+    @property
+    @abc.abstractmethod
+    def values(self) -> AbstractValues:
+        """What its outputs say of the return."""
 
     @abc.abstractmethod
     def atoms(
@@ -154,7 +157,7 @@ class Critic(AbstractCritic):
         sizes = (inputs, *self.hidden, self.values.atoms)
         weights |= draw_layers(sizes, self.initializer, self.normalization, key=layers_key)
         weights = scaled(weights, len(self.hidden), self.output_scale)
-        return CriticNetwork(weights, self, action_size)
+        return CriticNetwork(weights=weights, config=self, action_size=action_size)
 
 
 class CriticNetwork(AbstractCriticNetwork):
@@ -196,15 +199,19 @@ class ResidualCritic(AbstractCritic):
     def init(self, obs_size, action_size, *, key):
         sizes = (obs_size + action_size, *(self.width,) * (1 + 2 * self.blocks), self.values.atoms)
         weights = draw_layers(sizes, "uniform", "before", key=key)
-        return ResidualCriticNetwork(weights, self.values, action_size)
+        return ResidualCriticNetwork(weights=weights, config=self, action_size=action_size)
 
 
 class ResidualCriticNetwork(AbstractCriticNetwork):
     """Weights by name as in `MLPPolicy`; of block b the layers 2b + 1 and 2b + 2."""
 
     weights: dict[str, Float[Array, "..."]]
-    values: AbstractValues
+    config: ResidualCritic = eqx.field(static=True)
     action_size: int = eqx.field(static=True)
+
+    @property
+    def values(self) -> AbstractValues:
+        return self.config.values
 
     def atoms(self, obs, action):
         def layer(i, x):

@@ -191,10 +191,6 @@ class JointCritic(AbstractCritic):
 
     critic: Critic = Critic(hidden=(128, 128))  # the critic of each agent
 
-    @property
-    def values(self) -> AbstractValues:
-        return self.critic.values
-
     def init(self, obs_size, action_size, agents=1, *, key):
         networks = eqx.filter_vmap(
             lambda key: self.critic.init(agents * obs_size, agents * action_size, key=key)
