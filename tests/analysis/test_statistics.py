@@ -9,6 +9,8 @@ from credo.analysis.statistics import (
     interquartile_mean,
     mean_and_standard_error,
     moving_average,
+    probability_of_improvement,
+    success_rate,
 )
 
 
@@ -44,10 +46,10 @@ def test_interquartile_mean_by_hand(scores, expected):
     assert interquartile_mean(scores) == pytest.approx(expected, rel=1e-15)
 
 
-def test_interquartile_mean_is_that_of_each_column():
-    # As rliable: a 25 % trimmed mean; over all of 0..11 without 0,1,2 and 9,10,11.
+def test_interquartile_mean_pools_runs_and_tasks():
+    # As rliable: a 25 % trimmed mean over all 3 × 4 scores, 0..11 without 0,1,2 and 9,10,11.
     x = np.arange(12.0)[::-1].reshape(3, 4)
-    assert interquartile_mean(x.ravel()) == 5.5
+    assert interquartile_mean(x, axis=(0, 1)) == 5.5
     assert interquartile_mean(x).tolist() == [7.0, 6.0, 5.0, 4.0]
 
 
@@ -84,8 +86,32 @@ def test_bootstrap_is_seeded_and_columns_do_not_depend_on_their_neighbours():
 def test_bootstrap_in_blocks_is_the_bootstrap_in_one_piece(monkeypatch):
     x = np.random.default_rng(2).normal(size=(5, 3, 4))
     whole = bootstrap_interval(x, resamples=100)
+    whole_pooled = bootstrap_interval(x[:, 0], resamples=100, pooled=True)
     monkeypatch.setattr("credo.analysis.statistics.LARGEST_SAMPLE", 1000)
     np.testing.assert_array_equal(bootstrap_interval(x, resamples=100), whole)
+    np.testing.assert_array_equal(
+        bootstrap_interval(x[:, 0], resamples=100, pooled=True), whole_pooled
+    )
+
+
+def test_pooled_bootstrap_draws_each_task_on_its_own():
+    # Runs that are high on one task are low on the other: whole runs would always average ½.
+    x = np.array([[0.0, 1.0], [1.0, 0.0]])
+    low, high = bootstrap_interval(x, np.mean, confidence=0.9, pooled=True)
+    assert (low, high) == (0.0, 1.0)
+    low, high = bootstrap_interval(x.mean(axis=1), np.mean, confidence=0.9)
+    assert (low, high) == (0.5, 0.5)
+
+
+def test_pooled_bootstrap_covers_the_interquartile_mean():
+    # 95 % intervals of the IQM of 10 runs × 5 normal tasks; the true IQM is 0.
+    rng = np.random.default_rng(3)
+    covered = 0
+    for seed in range(100):
+        x = rng.normal(size=(10, 5))
+        low, high = bootstrap_interval(x, interquartile_mean, resamples=300, seed=seed, pooled=True)
+        covered += low <= 0.0 <= high
+    assert 85 <= covered <= 100
 
 
 def test_one_run_has_no_interval():
@@ -98,6 +124,32 @@ def test_bootstrap_is_that_of_scipy():
     rng = np.random.default_rng(0)
     known = scipy.stats.bootstrap((x,), np.mean, n_resamples=2000, method="percentile", rng=rng)
     np.testing.assert_array_equal(bootstrap_interval(x), known.confidence_interval)
+
+
+def test_probability_of_improvement_by_hand():
+    # 9 pairs: 4 > 1,2,3; 2 > 1; 0 beats none: 4 wins, 1 tie (2 = 2).
+    assert probability_of_improvement([4.0, 2.0, 0.0], [1.0, 2.0, 3.0]) == pytest.approx(4.5 / 9)
+    assert probability_of_improvement([1.0, 1.0], [1.0]) == 0.5
+    assert probability_of_improvement([np.nan, 1.0], [0.0]) == 0.5
+
+
+def test_probability_of_improvement_averages_over_tasks():
+    # Agarwal et al., section 4.3: the mean over tasks of P(X_m > Y_m), ties counted half.
+    rng = np.random.default_rng(4)
+    x, y = rng.integers(5, size=(6, 3)), rng.integers(5, size=(9, 3))
+    per_task = []
+    for task in range(3):
+        total = 0.0
+        for a, b in itertools.product(x[:, task], y[:, task]):
+            total += 1.0 if a > b else 0.5 if a == b else 0.0
+        per_task.append(total / (6 * 9))
+    assert probability_of_improvement(x, y) == pytest.approx(np.mean(per_task), rel=1e-12)
+    assert probability_of_improvement(y, x) == pytest.approx(1 - np.mean(per_task), rel=1e-12)
+
+
+def test_success_rate_counts_the_threshold_and_not_the_missing():
+    x = np.array([[1.0, 0.2], [0.9, np.nan], [0.5, 0.9], [0.95, 0.1]])
+    assert success_rate(x, 0.9).tolist() == [0.75, 0.25]
 
 
 def test_moving_average_is_shorter_at_the_start():
@@ -118,9 +170,11 @@ def test_moving_average_forgets_a_missing_value():
     ("call", "message"),
     [
         (lambda: mean_and_standard_error(3.0), "runs on axis 0"),
-        (lambda: mean_and_standard_error(np.zeros((0, 4))), "at least one"),
+        (lambda: success_rate(np.zeros((0, 4)), 0.5), "at least one"),
         (lambda: bootstrap_interval([1.0], confidence=95.0), "confidence is 95"),
         (lambda: bootstrap_interval([1.0], resamples=0), "resamples is 0"),
+        (lambda: bootstrap_interval([1.0, 2.0], pooled=True), r"\[runs, tasks\]"),
+        (lambda: probability_of_improvement(np.zeros((2, 3)), np.zeros((2, 4))), "must agree"),
         (lambda: moving_average([1.0], 0), "window is 0"),
     ],
 )

@@ -460,9 +460,9 @@ def test_a_folder_of_runs_is_evaluated_run_by_run_and_together(credo, seeds):
     code, out, _ = credo(f"evaluate {seeds} --episodes 20")
     lines = out.splitlines()
     assert (code, lines[0]) == (0, f"{seeds}/seed-3: 20 fresh episodes, {MEAN}")
-    assert lines[6] == f"{seeds}/seed-11: 20 fresh episodes, {MEAN}"
-    assert lines[12] == f"{seeds}: 2 runs, mean ± standard error over runs"
-    for alone, together in zip(lines[1:4], lines[13:], strict=True):  # the same run twice
+    assert lines[7] == f"{seeds}/seed-11: 20 fresh episodes, {MEAN}"
+    assert lines[14] == f"{seeds}: 2 runs, mean ± standard error over runs"
+    for alone, together in zip(lines[1:4], lines[15:], strict=True):  # the same run twice
         assert together.split()[1:] == [alone.split()[1], "±", "0"]
 
 

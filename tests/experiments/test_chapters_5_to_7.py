@@ -416,8 +416,8 @@ def test_the_check_of_baselines_says_what_is_to_be_exceeded():
     assert row[4].values == [-9.0]
     assert [x.value for x in shown["simple_spread"].references] == [-26.0, -7.5]
     played = measures.returns(
-        check_spread.SimpleSpread(),
-        tree.stack(check_spread.planner.RandomTeam(3)),
+        env := check_spread.SimpleSpread(),
+        tree.stack(check_spread.scripts.random_team(env)),
         4,
         measures.BASELINE_KEY,
     )

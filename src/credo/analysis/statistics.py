@@ -1,10 +1,10 @@
 """Statistics over independent runs: seeded, and vectorised over everything but the runs.
 
 `x` always has the runs on axis 0. A NaN is a missing score: it makes means, quantiles and
-intervals of its column NaN.
+intervals of its column NaN, and it loses every comparison.
 
-Source of the interquartile mean and of intervals by the bootstrap: Agarwal et al. 2021, "Deep
-Reinforcement Learning at the Edge of the Statistical Precipice".
+Source of the interquartile mean, the stratified bootstrap and the probability of improvement:
+Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice".
 """
 
 from typing import Protocol
@@ -14,14 +14,15 @@ import scipy.stats
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
+Axes = int | tuple[int, ...]
 
 LARGEST_SAMPLE = 4_000_000  # numbers held at once while resampling whole runs: 32 MB
 
 
 class Statistic(Protocol):
-    """`np.mean`, `np.median`, `interquartile_mean`: anything that reduces the axis it is given."""
+    """`np.mean`, `np.median`, `interquartile_mean`: anything that reduces the axes it is given."""
 
-    def __call__(self, x: Floats, /, *, axis: int) -> Floats: ...
+    def __call__(self, x: Floats, /, *, axis: Axes) -> Floats: ...
 
 
 def mean_and_standard_error(x: ArrayLike, ddof: int = 1) -> tuple[Floats, Floats]:
@@ -38,9 +39,15 @@ def mean_and_standard_error(x: ArrayLike, ddof: int = 1) -> tuple[Floats, Floats
     return mean, x.std(axis=0, ddof=ddof) / np.sqrt(runs)
 
 
-def interquartile_mean(x: ArrayLike, *, axis: int = 0) -> Floats:
-    """Mean of the middle half along `axis`: ⌊n/4⌋ of the n scores are dropped at either end."""
-    scores = np.sort(np.moveaxis(np.asarray(x, dtype=np.float64), axis, -1), axis=-1)
+def interquartile_mean(x: ArrayLike, *, axis: Axes = 0) -> Floats:
+    """Mean of the middle half along `axis`: ⌊n/4⌋ of the n scores are dropped at either end.
+
+    Over runs and tasks together, as Agarwal et al. report it: `axis=(0, 1)`.
+    """
+    x = np.asarray(x, dtype=np.float64)
+    axes = (axis,) if isinstance(axis, int) else axis
+    scores = np.moveaxis(x, axes, range(-len(axes), 0))
+    scores = np.sort(scores.reshape(*scores.shape[: scores.ndim - len(axes)], -1), axis=-1)
     cut = scores.shape[-1] // 4
     middle = scores[..., cut : scores.shape[-1] - cut].mean(axis=-1)
     # Sorting puts NaN last, where the cut would hide it.
@@ -53,38 +60,84 @@ def bootstrap_interval(
     confidence: float = 0.95,
     resamples: int = 2000,
     seed: int = 0,
+    *,
+    pooled: bool = False,
 ) -> tuple[Floats, Floats]:
     """Percentile bootstrap interval (low, high) of `statistic` over the runs of `x[runs, ...]`, by
     `scipy.stats.bootstrap`.
 
-    Whole runs are drawn with replacement and every column has an interval of its own: low and high
-    have shape `x.shape[1:]`. There is no interval, but NaN, of one run and of columns with a value
-    that is not finite.
+    By default whole runs are drawn with replacement and every column has an interval of its
+    own: low and high have shape `x.shape[1:]`. With `pooled`, the columns of `x[runs, tasks]`
+    are strata: each task draws its own runs, the statistic pools all of them, and low and high
+    are scalars (the stratified bootstrap of Agarwal et al.). There is no interval, but NaN, of one
+    run and of columns with a value that is not finite.
 
-    **Raises:** `ValueError` if `confidence` is not in (0, 1) or `resamples` is less than 1.
+    **Raises:** `ValueError` if `confidence` is not in (0, 1), `resamples` is less than 1, or pooled
+    columns are no matrix.
     """
     x = over_runs(x)
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence is {confidence}: it must lie in (0, 1)")
     if resamples < 1:
         raise ValueError(f"resamples is {resamples}: it must be at least 1")
-    columns = x.reshape(len(x), -1)
-    there = np.isfinite(columns).all(axis=0)
+    if pooled and x.ndim != 2:
+        raise ValueError(f"x has shape {x.shape}: pooled resampling needs [runs, tasks]")
+    if pooled:
+        samples, shape = tuple(x.T), ()
+        there = np.array(np.isfinite(x).all())
+    else:
+        columns, shape = x.reshape(len(x), -1), x.shape[1:]
+        there = np.isfinite(columns).all(axis=0)
+        samples = (columns[:, there],)
     bounds = np.full((2, *there.shape), np.nan)
     if len(x) > 1 and there.any():
-        sample = columns[:, there]
-        bounds[:, there] = scipy.stats.bootstrap(
-            (sample,),
-            statistic,
-            n_resamples=resamples,
-            batch=max(1, LARGEST_SAMPLE // sample.size),
-            vectorized=True,
-            confidence_level=confidence,
-            method="percentile",
-            rng=np.random.default_rng(seed),
-        ).confidence_interval
-    low, high = bounds.reshape(2, *x.shape[1:])
+        found = _percentiles(samples, statistic, confidence, resamples, seed)
+        bounds[:, there] = np.reshape(found, (2, -1))
+    low, high = bounds.reshape(2, *shape)
     return low, high
+
+
+def _percentiles(
+    samples: tuple[Floats, ...], statistic: Statistic, confidence: float, resamples: int, seed: int
+) -> tuple[Floats, Floats]:
+    """The interval over the runs of one sample `[runs, columns]`, or of tasks `[runs]` together."""
+
+    def of_tasks(*drawn: Floats, axis: int) -> Floats:
+        return statistic(np.stack(drawn, axis=-1), axis=(axis - 1, -1))
+
+    tasks = samples[0].ndim == 1
+    found = scipy.stats.bootstrap(
+        samples,
+        of_tasks if tasks else statistic,
+        n_resamples=resamples,
+        batch=None if tasks else max(1, LARGEST_SAMPLE // samples[0].size),
+        vectorized=True,
+        confidence_level=confidence,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    )
+    return found.confidence_interval
+
+
+def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
+    """P(X > Y) + ½ P(X = Y) for a run of `x[runs_x, ...]` against one of `y[runs_y, ...]`.
+
+    It is the Mann–Whitney U statistic over runs_x·runs_y, averaged over the trailing axes
+    (tasks), which must agree.
+    """
+    x, y = (np.nan_to_num(over_runs(z), nan=-np.inf, posinf=np.inf, neginf=-np.inf) for z in (x, y))
+    if x.shape[1:] != y.shape[1:]:
+        raise ValueError(
+            f"x has shape {x.shape}, y has {y.shape}: all axes but the first, the runs, must agree"
+        )
+    wins = (x[:, None] > y[None]).mean()
+    ties = (x[:, None] == y[None]).mean()
+    return float(wins + 0.5 * ties)
+
+
+def success_rate(x: ArrayLike, threshold: float) -> Floats:
+    """Share of the runs of `x[runs, ...]` that score `threshold` or more, in [0, 1]."""
+    return (over_runs(x) >= threshold).mean(axis=0)
 
 
 def moving_average(x: ArrayLike, window: int) -> Floats:

@@ -1,4 +1,10 @@
-"""What made the difference: our settings for 21-deep classification, less one ingredient each."""
+"""What made the difference: our settings for 21-deep classification, less one ingredient each.
+
+Not in the dissertation. The base is the cell "ours" of Figure 3.4a (section 3.2.1) at depth 21, and
+its runs are shared with that experiment; the author's success there, 87.6 %, is the level in the
+figure. Every cell has the same generations and so the same number of network evaluations: 1,000 at
+full, 300 at quick, 20 at smoke, where the depth is 3.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,6 +23,7 @@ from .sequences import TEST, curves, deepest, learning
 from .views import Table, constant, mean, median
 
 STREAM = {"smoke": 1_000, "quick": 10_000, "full": 100_000}
+"""Signals of a test stream, by budget, with 10 to 20 distractors after each."""
 INGREDIENTS: dict[str, Callable[[Any], dict[str, Any]]] = {  # fields of our algorithm that change
     "without saturated start": lambda x: {"network": replace(x.network, start_weights="drawn")},
     "without curriculum": lambda x: {"curriculum": replace(x.curriculum, start=x.env.depth)},
@@ -31,7 +38,8 @@ INGREDIENTS: dict[str, Callable[[Any], dict[str, Any]]] = {  # fields of our alg
 
 
 def cells(budget: str) -> list[Cell]:
-    """Ours, and with each change half as many runs."""
+    """Ours, and with each change half as many runs, but two at least: at full 10 and 5, at quick 3
+    and 2. The runs of a change have the first seeds of ours."""
     (ours,) = deepest(budget)
     seeds = ours.seeds[: max(len(ours.seeds) // 2, 2)]
 
@@ -43,7 +51,12 @@ def cells(budget: str) -> list[Cell]:
 
 
 def measure(trained: Trained) -> list[Row]:
-    """Success at the depth of training and at 101, and the shortest of four long streams."""
+    """Success at the depth of training and at 101, and the shortest of four long streams.
+
+    **Returns:** for each run "success" and "success at depth 101", shares of 1,000 fresh sequences
+    in [0, 1], and "signals right", the fewest signals that it answered right before its first
+    mistake in any of four streams. For the cell "signals fed", the length of a stream.
+    """
     far = first_mistakes(trained.champions, 101, TEST, key=jax.random.key(40_000))
     fed = STREAM[trained.budget]
     right = [row.value for row in streams(trained, fed, 4)]

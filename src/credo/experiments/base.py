@@ -63,7 +63,15 @@ from ..runs.store import Run
 from . import catalogue
 
 Axis = tuple[str, ArrayLike]  # "frames", and where on it
-BUDGETS = ("smoke", "quick", "full")  # seconds, minutes, hours
+BUDGETS = ("smoke", "quick", "full")
+"""How much to train: seconds, minutes or hours. `cells(budget)` turns the name into generations or
+frames, runs and sometimes fewer tasks.
+
+`smoke` shows that everything runs: tasks and networks are small, or runs end after a few
+generations; its numbers mean nothing. `quick` is a first impression of at most three runs. `full`
+is for results that are reported. Experiments whose full is shorter than the dissertation's may add
+`published`, with its generations or frames and its number of runs; some on MuJoCo have `million`.
+"""
 
 
 @dataclass(frozen=True)
@@ -136,11 +144,13 @@ class Trained:
 
     @property
     def scores(self) -> np.ndarray:
-        """The champions' tests `[runs, generations]`, of runs that are equally long."""
+        """The champions' tests `[runs, generations]`. Raises `ValueError` if runs differ in length,
+        as those that end by frames or a score may."""
         return np.stack([run.metrics["champion_score"] for run in self.runs])
 
     def part(self, seed: int | None = None, /, **labels: Label) -> "Trained":
-        """The same with more labels; with a `seed`, of that run alone."""
+        """The same with more labels; with a `seed`, of that run alone. A seed that the cell does
+        not have leaves no runs."""
         chosen = [i for i, x in enumerate(self.seeds) if seed in (x, None)]
         seeds, runs = [self.seeds[i] for i in chosen], [self.runs[i] for i in chosen]
         cell = replace(self.cell, labels={**self.labels, **labels}, seeds=seeds)
@@ -159,7 +169,8 @@ class Trained:
         return series(metric, *at, found, self.labels, seed=self.seeds, **axes)
 
     def fact(self, metric: str, value: Any, **labels: Label) -> Row:
-        """A row of the cell as a whole: a baseline, a bound."""
+        """A row of the cell as a whole, without a seed: a baseline, a bound. `labels` are added to
+        those of the cell."""
         return Row({**self.labels, **labels}, None, metric, value)
 
     def record(self) -> dict[str, Any]:
@@ -229,7 +240,11 @@ def grid(**axes: Iterable[Label]) -> list[dict[str, Label]]:
 
 
 def find(name: str) -> Experiment:
-    """The experiment of an id of the catalogue, with its texts and published numbers."""
+    """The experiment of an id of the catalogue, with its texts and published numbers.
+
+    A value of `dissertation.toml` takes `metric` and `source` from its table where it has none of
+    its own, a note the labels of its table. Raises `StopIteration` if no module has the id.
+    """
     module = importlib.import_module(f".{catalogue.module(name)}", __package__)
     told = [_texts()[part] for part in _texts()[name].get("parts", [name])]
     values = [
@@ -298,7 +313,11 @@ def reproduce(
 def trained(
     cells: list[Cell], budget: str, work: pathlib.Path, jobs: int | None, title: str
 ) -> list[Trained]:
-    """The cells with their runs, in folders of `work`; what is missing of them is trained."""
+    """The cells with their runs, in folders of `work`; what is missing of them is trained.
+
+    A run is in `work/<name of its cell>/<seed>`, whichever experiment asked for it first. `jobs`:
+    runs at a time; None: one per core.
+    """
 
     def path(cell: Cell, seed: int) -> pathlib.Path:
         return work / cell.folder / str(seed)

@@ -93,7 +93,8 @@ def over(run: Run, axis: str) -> np.ndarray:
 
 def scores(x: str = "frames", points: int = 100, digits: int = 2) -> Measure:
     """Series "test score" of the champions' tests, on a grid over `x` that all runs share: each
-    point has the last test that was over by then."""
+    point has the last test that was over by then. `x`: "frames" or "episodes". `points`: of the
+    grid, at most."""
 
     def measure(cell: Trained) -> list[Series]:
         xs = [over(run, x) for run in cell.runs]
@@ -106,7 +107,8 @@ def scores(x: str = "frames", points: int = 100, digits: int = 2) -> Measure:
 
 
 def last_tests(cell: Trained) -> list[Row]:
-    """The last test of each run, as logged and smoothed over generations."""
+    """The last test of each run, "last test" as logged and "last test, smoothed" over `SMOOTHED`
+    generations, in units of the task's return."""
     tested = [run.metrics["champion_score"] for run in cell.runs]
     smoothed = [statistics.moving_average(x, SMOOTHED)[-1] for x in tested]
     last = cell.rows("last test", [x[-1] for x in tested], 2)
@@ -122,7 +124,8 @@ def effort(cell: Trained) -> list[Row]:
 
 
 def first(metric: str, level: float, x: str) -> Measure:
-    """Where on `x` a test first reached `level`; null for runs in which none did."""
+    """Where on `x`, "frames" or "episodes", a test first reached `level`: a row `metric` for each
+    run, null for runs in which none did."""
 
     def measure(cell: Trained) -> list[Row]:
         found = []

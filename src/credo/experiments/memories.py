@@ -1,5 +1,13 @@
 """Tables 3.1 and 3.2, Figures 3.6 and 3.7, Algorithm 3: what the 21-deep champions of Figure 3.4a
-remember, when they write, and how far they count."""
+remember, when they write, and how far they count.
+
+The case study of section 3.2.3 looks into one network, "21-champ": its final memories (3.2.3.1,
+Table 3.1), its writes (3.2.3.2, Figures 3.6 and 3.7), how far it counts (3.2.3.3, Table 3.2) and
+the algorithm that it runs (3.2.3.4). Here every run of the cell is measured, so that a reader sees
+how usual such a network is, and the best run is shown on its own as the dissertation does. It is
+the one that answers most signals of random streams (`lengths`); Table 3.2 chooses it by streams of
+its own, one for each preset. A budget is that of Figure 3.4a; at smoke champions are 3-deep.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -17,6 +25,7 @@ from .sequences import deepest, deepest_coded
 from .views import SEED, Of, Table, computed, each, of_metric, of_seed
 
 SIGNALS = {"smoke": (100, 100), "quick": (10_000, 10_000), "full": (100_000, 1_000_000)}
+"""Signals -1, then +1, that the counting study feeds; at full those of Table 3.2."""
 SIGNS = ("-1", "+1")
 ROLES = {  # metrics of `memory.CellRole`
     "plus": "move at +1",
@@ -32,7 +41,12 @@ ROLES = {  # metrics of `memory.CellRole`
 
 
 def streams(trained: Trained, signals: int, count: int = 10) -> list[Row]:
-    """Signals of random streams of ±1 answered right in a row, by run and stream."""
+    """Signals of random streams of ±1 answered right in a row, by run and stream.
+
+    **Arguments:** `signals`: length of a stream, at least 1. `count`: how many streams.
+
+    **Returns:** a row "signals right" in 0..`signals` for each run and `stream`.
+    """
     found = counting.longest_correct(trained.champions, signals, count, key=jax.random.key(60_000))
     return trained.rows("signals right", found, stream=None)
 
@@ -70,7 +84,14 @@ def names(cells: int) -> list[str]:
 
 
 def probe(trained: Trained) -> Iterator[Row]:
-    """What each champion's memory ends in, by permutation, and its cells from 0 that are needed."""
+    """What each champion's memory ends in, by permutation, and its cells from 0 that are needed.
+
+    The sequences are those of Table 3.1: all 8 of depth 3, 15 distractors between signals.
+    **Returns:** for each run and permutation "memory" by cell, "signature" (needed cells in
+    ascending order of their value) by rank, and "right"; for each run "masking costs" by cell (the
+    share of success lost when it is held at 0), "needed", "spread within equal sums" and
+    "signature predicts class".
+    """
     task = SequenceClassification(depth=3, min_gap=15, max_gap=15)
     for seed, run in zip(trained.seeds, trained.runs, strict=True):
         one, found = trained.part(seed), memory.probe(run.champion, task)
@@ -132,7 +153,11 @@ EVERY_RUN = Table(
 
 def writes_on(signals: Sequence[float]) -> Callable[[Trained], Iterator[Row | Series]]:
     """A measure: writes of the best champion, 15 distractors between these signals; and for every
-    champion the share of its writing that happens at signals."""
+    champion the share of its writing that happens at signals.
+
+    **Returns:** series "input" of the cell and "write" (magnitude, by memory cell) of the best
+    champion over "step", counted from 1; rows "share at signals" in [0, 1], one per run.
+    """
 
     def measure(trained: Trained) -> Iterator[Row | Series]:
         depth, given = len(signals), jnp.asarray(signals, jnp.float32)
@@ -187,7 +212,12 @@ def ours_and_coded(budget: str) -> list[Cell]:
 
 def study(trained: Trained) -> Iterator[Row | Series]:
     """So many signals -1, then so many +1: the memory on the way, how many of each sign every cell
-    counted, and how many random signals are answered right."""
+    counted, and how many random signals are answered right.
+
+    **Returns:** for each run series "memory" by cell and sign over "signals of this sign" (1, 2, 5,
+    10, …), rows "signals counted" by cell and sign, and ten rows "signals right" (`streams`, as
+    long as the second part). "signals fed" by sign belongs to the cell.
+    """
     fed = SIGNALS[trained.budget]
     yield from rows("signals fed", fed, trained.labels, sign=SIGNS)
     found = counting.counting_study(trained.champions, *fed, key=jax.random.key(50_000))
@@ -267,7 +297,11 @@ COUNTED = Table(
 
 def roles(trained: Trained) -> Iterator[Row]:
     """Mean moves of each cell of each champion in 50 sequences, and what they amount to; of the
-    best one the whole algorithm as text."""
+    best one the whole algorithm as text.
+
+    **Returns:** the rows of `signals_right`, a text "algorithm", and for each run and memory cell
+    the metrics of `ROLES`; moves are in units of memory per step.
+    """
     best, *lengths = signals_right(trained)
     task, key = SequenceClassification(depth=21), jax.random.key(70_000)
     found = [memory.pseudo_algorithm(run.champion, task, key=key) for run in trained.runs]

@@ -1,6 +1,16 @@
 """Figures 5.3 and 5.4, Table 5.2 and beyond chapter 5: ERL, its parts and its champions on tasks of
 MuJoCo; and the check of TD3. Also what all experiments on MuJoCo share: tasks, budgets,
-measurements and the table of scores."""
+measurements and the table of scores.
+
+Section 5.5 compares ERL with its parts, EA and DDPG, and with PPO (Figure 5.3), leaves out
+selection (Figure 5.4) and counts what becomes of the learner's actors (Table 5.2). It has five
+runs, gives their standard deviation, and tests a champion in 5 episodes. `check-td3` compares TD3,
+which chapter 6 takes as given, with its authors' curves.
+
+`full` has 300,000 frames and 2 runs unless `PLANS` says otherwise, `million` the frames at which
+later papers report, `published` the author's. `quick` has the first two tasks and a quarter
+of the updates, `smoke` another task (`STAND_IN`).
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
@@ -47,6 +57,8 @@ PLANS: dict[Any, Plan] = {  # by budget; by budget and task where that has one o
     ("published", "Walker2d-v5"): Plan(8_000_000, 5),
     ("published", "Humanoid-v5"): Plan(1_000_000, 5),
 }
+"""Frames, runs and updates per frame of most cells of chapters 5 and 6. `published` has the
+author's frames, 2 million where a task has none of its own, and the dissertation's five runs."""
 
 
 def tasks(budget: str, of: Sequence[str] = TASKS) -> Sequence[str]:
@@ -94,7 +106,8 @@ def every(
 
 
 def td3(task: str, budget: str, gamma: float = 0.99) -> Cell:
-    """TD3 with the constants of its authors, alone, or at another discount."""
+    """TD3 with the constants of its authors, alone, or at another discount `gamma` in [0, 1], which
+    is then a label. At their discount, 0.99, there are three runs at full."""
     if gamma == 0.99:
         runs = plan(budget, task)
         runs = runs._replace(runs=3) if budget == "full" else runs
@@ -184,7 +197,12 @@ def ablation(results: Results, values: Sequence[Value]) -> Iterable[page.Table]:
 
 
 def fates(cell: Trained) -> list[Row]:
-    """Shares of the learner's actors that were judged in the population, and what chance says."""
+    """Shares of the learner's actors that were judged in the population, and what chance says.
+
+    **Returns:** for each run "fate" in [0, 1] by `fate` (elite, selected, discarded), and
+    "injected", how many were judged; for the cell "by chance" by `fate`, and "sync period", the
+    generations from one copy of the learner's actor to the next.
+    """
     metrics, algorithm = [run.metrics for run in cell.runs], cell.cell.algorithm
     counts = [int(attribution.injected(m)[0]) for m in metrics]
     return [

@@ -1,4 +1,8 @@
-"""Figure 7.5: paths of teams at coupling 3."""
+"""Figure 7.5: paths of teams at coupling 3.
+
+Section 7.5 shows MERL before and after it learned that three rovers must meet, and MATD3 on the
+mixed reward. Fully trained is the budget's frames of `rovers.PLANS`, partly trained `PARTLY`.
+"""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -32,7 +36,11 @@ def cells(budget: str) -> list[Cell]:
 
 
 def paths(cell: Trained) -> list[Row | Series]:
-    """Where rovers of each run drove in one world (m), and which POIs they observed."""
+    """Where rovers of each run drove in one world (m), and which POIs they observed.
+
+    **Returns:** series "x" and "y" by `rover` over "step"; "observed", 1 or 0, by `poi`; and of the
+    cell "POI x" and "POI y" by `poi`, "activation distance" and "size" of the world, all in metres.
+    """
     key, found = jax.random.key(SEED), []
     worlds = [cell.env.shown(record(cell.env, run.champion, key=key)) for run in cell.runs]
     place = np.array([world["position"] for world in worlds], np.float64)

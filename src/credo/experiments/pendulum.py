@@ -1,4 +1,12 @@
-"""Figure 5.2: the double pendulum, and the same paid only at the end of an episode."""
+"""Figure 5.2: the double pendulum, and the same paid only at the end of an episode.
+
+The motivating example of chapter 5 (section 5.2): EA, DDPG and ERL by the episodes that they need,
+those of the whole population and the learner together. The hard task pays the return of an episode
+at its last step; to EA, which uses only returns, both are the same. Added here are ERL with our
+settings, and DDPG that sees returns spread over the episode. Section 5.2 has ERL solve the hard
+task in 10,000 episodes and EA in 22,000: `full` has at most 10,000, of EA 25,000, and 3 runs;
+`published` is the same with 5.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,5 +1,10 @@
 """How long cells with gradient learners are trained, and any of them made small enough to end in
-seconds (budget `smoke`)."""
+seconds (budget `smoke`).
+
+Chapters 5 to 7 count training in frames, environment steps of the whole population and of learners
+together, as the dissertation does (sections 5.5 and 7.5); tests are not counted. A `Plan` also has
+the updates per frame: the author's programs make one, and a plan with fewer is that much cheaper.
+"""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -17,6 +22,8 @@ FIELDS = {
     "test_episodes": 2,
     "test_every": 200,
 }
+"""What `shrunk` sets in an algorithm that has such a field, so that learning, migration and a test
+can happen within the 600 to 1,500 frames of a smoke run."""
 TEAM_FIELDS = {
     "replay_capacity": 5_000,
     "population_size": 5,
@@ -25,11 +32,12 @@ TEAM_FIELDS = {
     "start_frames": 100,
     "test_every": 300,
 }
+"""The same of teams, in place of or beside `FIELDS`."""
 
 
 class Plan(NamedTuple):
-    """The runs of a cell: environment steps of each, how many runs, and gradient updates for each
-    of these steps."""
+    """The runs of a cell: environment steps of each (of a team: joint steps), how many runs, and
+    gradient updates of each learner for each of these steps."""
 
     frames: int
     runs: int
@@ -39,8 +47,13 @@ class Plan(NamedTuple):
 def planned(
     labels: Labels, algorithm: Any, plan: Plan, budget: str, first_seed: int = 0, **ends: Any
 ) -> Cell:
-    """A cell by plan; shrunk at smoke. `ends`: limits of a run other than frames, as `Cell` has
-    them. An algorithm without learners makes no updates."""
+    """A cell by plan; shrunk at smoke.
+
+    **Arguments:** `first_seed`: of consecutive ones, as many as the plan has runs; above 0 where
+    settings were chosen by looking at lower seeds. `ends`: limits of a run other than frames, as
+    `Cell` has them. `updates_per_frame` of the plan replaces that of the algorithm, where it has
+    the field.
+    """
     if hasattr(algorithm, "updates_per_frame"):
         algorithm = dataclasses.replace(algorithm, updates_per_frame=plan.updates_per_frame)
     if budget == "smoke":

@@ -1,4 +1,11 @@
-"""Chapter 6 and beyond: CERL, what its portfolios are made of, and its resource managers."""
+"""Chapter 6 and beyond: CERL, what its portfolios are made of, and its resource managers.
+
+Figure 6.2 is the motivating example (section 6.1): two learners that fail alone, on Hopper. The
+others are of section 6.3: CERL beside evolution and each of its four learners alone (Figure 6.3 on
+Humanoid, with ERL of one learner; Figure 6.5 on four more tasks), the manager's exploration (Figure
+6.4), and how workers were allocated (Table 6.1). `beyond-6` has a portfolio of TD3 and SAC under
+three managers. Budgets are those of `mujoco`, but `quick` has the first task only.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -19,6 +26,7 @@ from .views import Table, mean, published
 
 PORTFOLIO = (0.9, 0.99, 0.997, 0.9995)  # γ of learners L1 to L4
 EXTREME = (0.0, 1.0)
+"""γ of the two learners of Figure 6.2: one sees only the next reward, the other all of them."""
 TASKS = ("Hopper-v5", "Swimmer-v5", "HalfCheetah-v5", "Walker2d-v5")
 HOPPER, HUMANOID = ("Hopper-v5",), ("Humanoid-v5",)
 MANAGERS = {"ucb": UCB(), "uniform": Uniform(), "thompson": Thompson()}

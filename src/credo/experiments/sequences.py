@@ -1,5 +1,18 @@
 """Figures 3.4 and 3.9: success of evolved networks on sequence classification and recall, by depth.
-Also what all of chapter 3 shares: cells, success, learning curves, the table."""
+Also what all of chapter 3 shares: cells, success, learning curves, the table.
+
+| figure | section | compared |
+|---|---|---|
+| 3.4a | 3.2.1 | classification by depth, MMUs of three presets |
+| 3.4b | 3.2.1 | classification to depth 6, MMU beside recurrent networks |
+| 3.9a | 3.3.1 | recall by depth, MMUs of two presets |
+| 3.9b | 3.3.1 | recall, MMU beside recurrent networks |
+
+The dissertation compares with NEAT-RNN and NEAT-LSTM as published by others; here LSTM, GRU and RNN
+of as many units are evolved by the same operators. At `full` evolution has the dissertation's 1,000
+generations on classification and 10,000 on recall, and an MMU its 10 runs. `quick` has fewer
+generations and runs, `smoke` one depth.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -23,6 +36,7 @@ from .views import Curves, Table, constant, known, mean, median, published
 
 TEST = 1000  # fresh sequences for a final champion; the dissertation used 50
 PRESETS = ("as written", "as coded", "ours")
+"""Settings as the text prints them, as the author's program had them, and the best found here."""
 NETWORKS = ("mmu", "lstm", "gru", "rnn")
 TASKS = {"classification": SequenceClassification, "recall": SequenceRecall}
 HIDDEN = {"classification": 5, "recall": 20}  # units, as in the author's code
@@ -39,6 +53,7 @@ GENERATIONS = {  # by gradient: thousands of instances; recall still improves af
 RUNS = {"smoke": 2, "quick": 3, "full": 10}
 FEWER = {"smoke": 2, "quick": 2, "full": 5}  # of what fails alike, and of networks beside the MMU
 LINE = ("preset", "trainer", "network", "memory", "at equal instances", "ties free")
+"""Labels by which cells of one task and depth differ: what lines and rows of the table are of."""
 
 # Depths of the task, by budget.
 CLASSIFICATION = {"smoke": (3,), "quick": (2, 5, 10, 21), "full": (2, 3, 4, 5, 6, 10, 15, 21)}
@@ -60,10 +75,14 @@ def cell(
 ) -> Cell:
     """Runs of one trainer, network and task of chapter 3.
 
-    **Arguments:** `network`: mmu, lstm, gru or rnn, of the size that the task's MMU has. `memory`:
-    cells of an MMU with encoder and decoder learned; None: as many as hidden units. `equal`:
-    evolution ends when the gradient does, at equal reinforcement instances: one is a network times
-    a training sequence (section 3.4), and both use 1,000 per generation.
+    Our settings have seeds from 200 on, those of the dissertation and its code from 0.
+
+    **Arguments:** `task`: classification or recall. `depth`: signals, or turns, of a sequence, at
+    least 1. `preset`: of `PRESETS`. `trainer`: evolution or gradient. `network`: mmu, lstm, gru or
+    rnn, of the size that the task's MMU has. `memory`: cells of an MMU with encoder and decoder
+    learned; None: as many as hidden units. `equal`: evolution ends when the gradient does, at equal
+    reinforcement instances: one is a network times a training sequence (section 3.4), and both use
+    1,000 per generation.
     """
     labels = {"task": task, "depth": depth, "preset": preset, "trainer": trainer}
     labels |= {"network": network} | ({"memory": memory} if memory else {})
@@ -86,7 +105,11 @@ def every(
     networks: Sequence[str] = ("mmu",),
     **settings: Any,
 ) -> Callable[[str], list[Cell]]:
-    """The cells of every combination, by budget. `depths`: by budget. `settings`: of `cell`."""
+    """The cells of every combination, by budget. `depths`: by budget. `settings`: of `cell`.
+
+    **Returns:** what `Experiment.cells` is: a function of the budget's name. Its order is that of
+    the arguments: presets slowest, depths fastest.
+    """
     return lambda budget: [
         cell(budget, task, depth, preset, network=network, **settings)
         for preset in presets
@@ -114,20 +137,28 @@ def with_free_ties(budget: str) -> list[Cell]:
 
 def success(trained: Trained) -> list[Row]:
     """Strict success of the final champions on the same fresh sequences: the share of them that is
-    answered right at every signal. No training run draws from the seed used here."""
+    answered right at every signal. No training run draws from the seed used here.
+
+    **Returns:** a row "success" in [0, 1] for each run.
+    """
     found = evaluate(trained.env, trained.champions, TEST, key=jax.random.key(10_000))
     return trained.rows("success", jnp.mean(found.returns["success"], axis=1), 4)
 
 
 def baseline(trained: Trained) -> list[Row]:
-    """The best of three policies that keep at most one signal (the first, the last, none)."""
+    """The best of three policies that keep at most one signal (the first, the last, none): a row
+    "baseline success" in [0, 1] of the task, exact, labelled with the policy's name."""
     policy, value = bounds.best_baseline(trained.env)
     return [trained.fact("baseline success", round(value, 4), policy=policy)]
 
 
 def learning(trained: Trained) -> list[Row | Series]:
     """Each generation's champion on its 50 fresh sequences, as logged: raw, and smoothed by the
-    author's moving average over 100 generations; every tenth generation, and the last one."""
+    author's moving average over 100 generations; every tenth generation, and the last one.
+
+    **Returns:** for each run series "test success" and "test success, smoothed" over "generation",
+    and rows "last test success" and "last test success, smoothed", all in [0, 1].
+    """
     scores, found = trained.scores, []
     at = np.arange(10, scores.shape[1] + 1, 10)
     for kind, x in (("", scores), (", smoothed", statistics.moving_average(scores, 100))):

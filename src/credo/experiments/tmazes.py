@@ -1,5 +1,14 @@
 """Figures 4.2 to 4.4: robots in Extended T-Mazes, beside a static one (Converge and Spread) and in
-teams that learn. Also the budgets and learning curves of all of chapter 4."""
+teams that learn. Also the budgets and learning curves of all of chapter 4.
+
+Figures 4.2 (Converge, section 4.1.4) and 4.3 (Spread, 4.1.5) have one learning robot beside a
+static one: FSP explores the endpoints in a fixed order, RESP in one drawn for each evaluation.
+Figure 4.4 (4.1.6) has teams of 2 to 4 that learn. All are at depths 2 and 3 (4 and 8 endpoints) and
+compare MMUs with feed-forward networks of as many hidden units: what memory is worth.
+
+The dissertation has 10 runs and tests of 15 evaluations. `published` is 10,000 generations and 10
+runs, `quick` 200 and 2; the function `full` says what `full` is.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -43,7 +52,9 @@ OPERATORS: dict[str, Any] = {
     "mutation": author_mutation(limit=40.0, fraction=0.03, reset_probability=0.1),
     "cross_repeated": True,
 }
-ISLANDS = Islands(4, renewal=0.002)  # of Converge beside FSP; beside RESP they do not help
+ISLANDS = Islands(4, renewal=0.002)
+"""Of Converge beside FSP; beside RESP they did not help. docs/notes/team-memory.md has the trials
+behind this, `START` and `OPERATORS`, and the seeds that they were made with."""
 SMOKE = {"population_size": 12, "elite_fraction": 0.34, "teams": 1}  # an elite an island
 SMOKE |= {"episodes": 2, "test_episodes": 2}
 PLANS = {"smoke": (5, 2), "quick": (200, 2), "published": (10_000, 10)}  # generations, runs
@@ -130,7 +141,8 @@ def smoothed(metric: str, digits: int) -> Measure:
 
 
 def levels(trained: Trained) -> list[Row]:
-    """Exact shares of policies that take no learning, and their upper bound."""
+    """Exact shares of policies that take no learning, and their upper bound: facts "baseline" by
+    `policy`, and "upper bound", whose label `kind` is "optimal" where a policy reaches it."""
     known, (bound, kind) = bounds.baselines(trained.env), bounds.upper_bound(trained.env)
     baselines = [trained.fact("baseline", round(known[k], 4), policy=k) for k in known]
     return [*baselines, trained.fact("upper bound", round(bound, 4), kind=kind)]
@@ -138,7 +150,11 @@ def levels(trained: Trained) -> list[Row]:
 
 def shares(trained: Trained) -> Iterator[Row | Series]:
     """Shares of trials in which the reward is observed, in 1,000 fresh episodes (the dissertation
-    used 15); and one episode of the best champion, if it has memory."""
+    used 15); and one episode of the best champion, if it has memory.
+
+    **Returns:** a row "share of trials" in [0, 1] for each run; of a cell with memory "best run"
+    (its place among the seeds, from 0) and the series of `episode` over "trial".
+    """
     final = returns(trained.env, trained.champions, 1000, reward="score").mean(axis=1)
     yield from trained.rows(METRIC, final, 4)
     best = int(np.argmax(np.where(np.isfinite(final), rounded(final, 4), -np.inf)))
