@@ -6,6 +6,7 @@ atoms, and how far atoms are from that target.
 """
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -39,7 +40,7 @@ class AbstractValues(eqx.Module):
 class Mean(AbstractValues):
     """The expected return alone; of several critics the least (Fujimoto et al. 2018)."""
 
-    atoms: int = eqx.field(static=True, init=False, default=1)
+    atoms: ClassVar[int] = 1  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def mean(self, atoms):
         return atoms[0]
