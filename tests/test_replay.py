@@ -8,7 +8,7 @@ import pytest
 from compilations import compilations
 
 from credo import replay, tree
-from credo.replay import Replay
+from credo.replay import Replay, Sampling
 from credo.types import Transition
 
 CAPACITY = 5
@@ -129,7 +129,7 @@ def test_the_number_of_rows_is_data_and_the_old_buffer_is_gone():
 def test_samples_are_uniform_over_the_filled_rows(written):
     ring = replay.extend(Replay.empty(ROW, CAPACITY), rows(np.arange(1, written + 1)))
     n = 6000
-    drawn = numbers(jax.jit(lambda key: ring.sample(n, key=key))(jax.random.key(0)))
+    drawn = numbers(jax.jit(lambda key: ring.sample(n, key=key)[0])(jax.random.key(0)))
     filled = held(ring)
     assert len(filled) == min(written, CAPACITY)
     found, counts = np.unique(drawn, return_counts=True)
@@ -137,7 +137,7 @@ def test_samples_are_uniform_over_the_filled_rows(written):
     expected = n / len(filled)
     # The 0.999 quantile of chi-squared with at most 4 degrees of freedom.
     assert np.sum((counts - expected) ** 2 / expected) < 18.5
-    again = numbers(ring.sample(20, key=jax.random.key(1)))
+    again = numbers(ring.sample(20, key=jax.random.key(1))[0])
     assert again != drawn[:20]
     assert len(set(again)) < 20  # with replacement
 
@@ -217,7 +217,7 @@ def assert_frames(sample):
 @pytest.mark.parametrize("together", [True, False])
 def test_a_teams_sample_has_an_axis_of_agents_everywhere(together):
     ring = replay.extend(Replay.empty(TEAM_ROW, 8), frames(np.arange(1, 7)))
-    sample = ring.sample(40, together=together, key=jax.random.key(0))
+    sample = ring.sample(40, together=together, key=jax.random.key(0))[0]
     shapes = jax.tree.map(jnp.shape, sample)
     assert shapes.obs == shapes.next_obs == (40, AGENTS, 2)
     assert shapes.action == (40, AGENTS, 1)
@@ -233,7 +233,7 @@ def test_each_agent_draws_frames_of_its_own():
     ring = replay.extend(Replay.empty(TEAM_ROW, CAPACITY), frames(np.arange(1, CAPACITY + 1)))
     n = 5000
     apart, joint = (
-        assert_frames(ring.sample(n, together=together, key=jax.random.key(2))) - 1
+        assert_frames(ring.sample(n, together=together, key=jax.random.key(2))[0]) - 1
         for together in (False, True)
     )
     pairs = [np.bincount(CAPACITY * x[:, 0] + x[:, 2], minlength=25) for x in (apart, joint)]
@@ -255,7 +255,7 @@ def test_a_ring_of_joint_frames_goes_round():
         filled = tree.take(ring.data, jnp.arange(len(kept)))
         jax.tree.map(np.testing.assert_array_equal, filled, frames(kept))
     assert (by_hand.written, int(ring.position), int(ring.size)) == (8, 3, CAPACITY)
-    found = assert_frames(ring.sample(60, key=jax.random.key(0)))
+    found = assert_frames(ring.sample(60, key=jax.random.key(0))[0])
     assert set(found.ravel().tolist()) == set(by_hand.held())
 
 
@@ -266,5 +266,65 @@ def test_a_team_of_one_draws_as_one_agent_does():
     samples = []
     for data in (one, alone):
         row = jax.tree.map(lambda x: jnp.asarray(x[0]), data)
-        samples.append(replay.extend(Replay.empty(row, 5), data).sample(9, key=jax.random.key(1)))
+        samples.append(
+            replay.extend(Replay.empty(row, 5), data).sample(9, key=jax.random.key(1))[0]
+        )
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[:, 0], y), *samples)
+
+
+def returns_by_hand(written, start, steps, gamma):
+    """What an n-step transition from the frame with the number `start` has: the discounted sum, the
+    number of its last frame, and the discount behind it. Frames up to `written` were written."""
+    total, discount, last = 0.0, 1.0, start
+    for step in range(steps):
+        last = start + step
+        total, discount = total + discount * last, gamma * discount
+        if last % 3 == 0 or last % 5 == 0 or last == written:  # an end, or the newest frame
+            break
+    return total, last, discount
+
+
+@pytest.mark.parametrize("written", [4, 11, 23])
+@pytest.mark.parametrize("steps", [2, 3, 6])
+def test_transitions_of_several_steps_end_with_episodes_and_with_the_buffer(written, steps):
+    """Also where the ring has been overwritten."""
+    ring = replay.extend(Replay.empty(ROW, 9), rows(np.arange(1, written + 1)))
+    drawn = ring.sample(200, Sampling(steps), 0.5, key=jax.random.key(0))
+    sample, discount = jax.tree.map(np.asarray, drawn)
+    seen = set()
+    for i, start in enumerate(sample.obs[:, 0].astype(int)):
+        total, last, behind = returns_by_hand(written, start, steps, 0.5)
+        assert sample.rewards["a"][i] == pytest.approx(total)
+        assert sample.rewards["b"][i] == pytest.approx(2 * total)
+        assert sample.next_obs[i, 0] == last + 0.5
+        assert (sample.terminated[i], sample.truncated[i]) == (last % 3 == 0, last % 5 == 0)
+        assert discount[i] == pytest.approx(behind)
+        assert sample.action[i, 0] == 10 * start
+        seen.add(start)
+    assert seen == set(range(max(1, written - 8), written + 1))
+
+
+def test_a_transition_is_drawn_half_as_often_at_its_half_life():
+    ring = replay.extend(Replay.empty(ROW, 60), rows(np.arange(1, 101)))
+    drawn, _ = ring.sample(40_000, Sampling(half_life=10.0), key=jax.random.key(0))
+    age = 100 - np.asarray(drawn.obs)[:, 0].astype(int)
+    counts = np.bincount(age, minlength=60)
+    expected = 0.5 ** (np.arange(60) / 10)
+    expected *= len(age) / expected.sum()
+    # The 0.999 quantile of chi-squared with 59 degrees of freedom.
+    assert len(counts) == 60
+    assert np.sum((counts - expected) ** 2 / expected) < 98.3
+
+
+def test_the_spread_of_a_reward_counts_what_was_written():
+    ring = replay.extend(Replay.empty(ROW, 60), rows(np.arange(1, 5)))
+    assert ring.spread("b") == pytest.approx(2 * np.sqrt((1 + 4 + 9 + 16) / 4))
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [({"steps": 0}, "steps is 0"), ({"half_life": 0.0}, "half_life is 0.0: it must be above 0")],
+)
+def test_bad_sampling_is_refused(given, said):
+    with pytest.raises(ValueError, match=said):
+        Sampling(**given)

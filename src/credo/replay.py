@@ -122,15 +122,14 @@ class Replay(eqx.Module):
         if sampling.steps == 1:
             return rows, None
         discount = jnp.full(rows.terminated.shape, gamma)
+        on = jnp.ones(rows.terminated.shape, bool)
         for step in range(1, sampling.steps):
             # Episodes lie one behind the other, and behind the newest row there is the oldest.
             at = (index + step) % self.capacity
-            on = ~(rows.terminated | rows.truncated)
+            on = on & ~(rows.terminated | rows.truncated)
             on = on & jnp.broadcast_to(at != self.position, on.shape)
-            rows, discount = (
-                rows.followed(self._rows(at), on, discount),
-                jnp.where(on, gamma * discount, discount),
-            )
+            rows = rows.followed(self._rows(at), on, discount)
+            discount = jnp.where(on, gamma * discount, discount)
         return rows, discount
 
     def _rows(self, index: Int[Array, "n *agents"]) -> Transition:

@@ -425,7 +425,7 @@ def test_the_value_of_an_agent_that_ends_is_its_last_reward():
     row = eqx.tree_at(lambda x: x.rewards["local"], row, jnp.array([1.0, 0.0]))
     replay = extend(Replay.empty(row, 1), jax.tree.map(lambda x: x[None], row), jnp.ones(1, bool))
     for together in (False, True):
-        rows = replay.sample(3, together=together, key=jax.random.key(0))
+        rows = replay.sample(3, together=together, key=jax.random.key(0))[0]
         ends = (rows.terminated, rows.truncated, rows.active)
         batch = Batch(rows.obs, rows.action, rows.rewards["local"], rows.next_obs, *ends)
         target = learner.bellman_target(state, batch, key=jax.random.key(0))

@@ -51,7 +51,7 @@ def test_it_is_one_update_after_the_other_each_on_rows_of_its_own(replay, start)
     update = eqx.filter_jit(lambda state, batch, key: LEARNER.update(state, batch, key=key))
     for i in range(3):
         sample_key, update_key = jax.random.split(jax.random.fold_in(KEY, i))
-        rows = replay.sample(4, key=sample_key)
+        rows = replay.sample(4, key=sample_key)[0]
         drawn.append(np.asarray(rows.obs).tobytes())
         batch = Batch(
             rows.obs, rows.action, rows.rewards["a"], rows.next_obs, rows.terminated, rows.truncated

@@ -301,7 +301,7 @@ def test_agents_learn_from_the_same_frames_if_a_critic_sees_them_all(name, rows)
         learner, start(name), ring(rows), jnp.int32(1), signal="other", key=key
     )
     sample_key, update_key = jax.random.split(jax.random.fold_in(key, 0))
-    x = ring(rows).sample(N, together=learner.together, key=sample_key)
+    x = ring(rows).sample(N, together=learner.together, key=sample_key)[0]
     batch = Batch(
         x.obs, x.action, x.rewards["other"], x.next_obs, x.terminated, x.truncated, x.active
     )

@@ -1,0 +1,58 @@
+"""Who gets the frames."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from credo.algorithms.erl import ERL
+from credo.environments.probes import Copy
+from credo.learners.share import Earned, Fixed
+from credo.learners.td3 import TD3
+from credo.networks.mlp import MLP, Critic
+
+LEARNER = TD3(critic=Critic(hidden=(4,)), batch_size=4)
+SMALL = {"population_size": 4, "elite_fraction": 0.25, "warmup_frames": 0, "sync_period": 1}
+
+
+def test_learners_earn_the_part_of_the_population_that_they_beat():
+    share = Earned(0.2, 0.8, memory=0.5)
+    fitness = jnp.asarray([3.0, 1.0, 2.0, 0.0])
+    guests = jnp.asarray([False, False, True, False])
+    # It beats two of three: the aim is 0.2 + 0.6·2/3 = 0.6, and half of the way is gone.
+    assert share.after(jnp.float32(0.4), fitness, guests) == pytest.approx(0.5)
+    none = jnp.zeros(4, bool)
+    assert share.after(jnp.float32(0.4), fitness, none) == pytest.approx(0.4)
+    assert share.first() == pytest.approx(0.5)
+    assert Fixed(0.3).after(jnp.float32(0.3), fitness, guests) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(("learners", "rounds"), [(0.0, 1), (0.5, 4), (0.75, 12)])
+def test_learners_play_in_rounds_until_they_have_their_share(learners, rounds):
+    """Every episode of the task has as many frames: four members beside so many rounds of one."""
+    erl = ERL.erl(
+        Copy(), MLP((4,)), learners=(LEARNER,), share=Fixed(learners), episodes=1, **SMALL
+    )
+    state = erl.init(key=jax.random.key(0))
+    state, metrics = jax.jit(erl.generation)(state, key=jax.random.key(1))
+    frames = erl.env.max_steps
+    assert metrics["learner_rounds"] == rounds
+    assert state.frames == metrics["frames"] == frames * (4 + rounds)
+    assert metrics["updates"] == frames * (4 + rounds)
+    assert state.episodes == 4 + rounds
+    assert state.replay.written == state.frames
+    assert np.isfinite(metrics["critic_loss_0"])
+    assert frames * (4 + rounds) <= erl.most_frames
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Fixed(1.0), "learners is 1.0"),
+        (lambda: Earned(0.5, 0.4), "least is 0.5"),
+        (lambda: Earned(memory=2.0), "memory is 2.0"),
+    ],
+)
+def test_bad_shares_are_refused(make, said):
+    with pytest.raises(ValueError, match=said):
+        make()
