@@ -221,3 +221,33 @@ def test_what_cannot_be_asked_is_refused():
 def test_a_team_without_memory_has_two_endpoints_to_go_to():
     assert tmaze.baselines(task(2, partner=None, robots=3)) == {"one at each end": 0.5}
     assert tmaze.baselines(task(3, partner=None, robots=2)) == {"one at each end": 0.25}
+
+
+@pytest.mark.parametrize("objective", ["converge", "spread"])
+@pytest.mark.parametrize("depth", [1, 2, 3])
+@pytest.mark.parametrize(("robots", "partner"), [(1, "fsp"), (1, "resp"), (2, None), (3, None)])
+def test_no_baseline_is_above_the_bound(objective, depth, robots, partner):
+    env = task(depth, objective, partner=partner, robots=robots)
+    bound = tmaze.upper_bound(env).value
+    for name, value in tmaze.baselines(env).items():
+        assert 0.0 <= value <= bound + 1e-12, name
+
+
+@pytest.mark.parametrize("objective", ["converge", "spread"])
+def test_a_team_without_memory_has_its_baseline(objective):
+    """Played: in Converge all go to one end, in Spread one to each."""
+    env = task(2, objective, partner=None, robots=2)
+    ((name, value),) = tmaze.baselines(env).items()
+    ends = (0, 0) if objective == "converge" else (0, env.endpoints - 1)
+    goals = [g for g, _ in histories(dataclasses.replace(env, partner="fsp", robots=1))]
+    seen = [
+        all(e == g for e in ends) if objective == "converge" else g in ends
+        for x in goals
+        for g in x
+    ]
+    assert value == pytest.approx(np.mean(seen)), name
+
+
+def test_of_a_team_beside_a_static_robot_no_baseline_is_known():
+    with pytest.raises(ValueError, match="2 robots beside 'fsp'"):
+        tmaze.baselines(task(2, "converge", robots=2))

@@ -562,6 +562,7 @@ def test_all_settings_are_written_and_read(credo, tmp_path, monkeypatch):
         'task = "stranger_1.team"',
         'rewards = ["global=stranger_1:pay"]',
         'kwargs = ["task=stranger_1:f"]',
+        'algorithm = ["td3", "stranger_1.team"]',
         'trust = true\nlearner = "stranger_1:Learner"',
         'learner = "stranger-:Learner"',
         "rewards = [\"global='stranger_1\\\\x3apay'\"]",
@@ -578,6 +579,7 @@ def test_a_file_of_settings_names_no_code_without_trust(credo, tmp_path, monkeyp
     code, _, err = credo(f"train {words} --config run.toml {trust}")
     assert code == 2
     told = "maybe code of others: look into it, and give --trust"
+    told = "give one word" if text.startswith("algorithm = [") else told
     assert ("for the command line alone" if "trust =" in text else told) in err
     assert (tmp_path / "kept").exists()
     assert not (tmp_path / "begun").exists()

@@ -180,7 +180,7 @@ def test_a_script_without_a_guard_starts_no_more(tmp_path):
     )
     assert told.returncode == 1
     assert told.stderr.count("imported\n") == 2  # here, and in one worker
-    assert "unguarded starts training when it is imported" in told.stderr
+    assert "unguarded opens a task when it is imported" in told.stderr
     assert "put it under if __name__ == '__main__'" in told.stderr
 
 

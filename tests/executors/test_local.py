@@ -1,6 +1,7 @@
 """Many runs, a process each: what is finished stays, what fails is told, the rest goes on."""
 
 import dataclasses
+import importlib
 import json
 import os
 import shutil
@@ -17,6 +18,7 @@ from credo.environments import processes
 from credo.environments.sequence_classification import SequenceClassification
 from credo.evolution.breeder import altered
 from credo.executors import local
+from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.runs import config, loop
 from credo.runs.options import RunOptions
@@ -325,3 +327,20 @@ def test_what_a_stranger_recorded_is_not_trusted_by_a_worker(tmp_path):
     assert json.loads(job.message())["again"]["trust"] is False  # and nothing was imported for it
     assert config.changed(tree, tree) == []
     assert os.listdir(tmp_path) == []
+
+
+def test_modules_that_open_a_task_while_they_are_imported_are_trained(tmp_path, monkeypatch):
+    lines = (
+        "from credo.environments.gymnasium import Gymnasium",
+        "from credo.environments.probes import Copy",
+        "SIZE = Gymnasium('Pendulum-v1').obs_size",
+        "class Mine(Copy):",
+        "    '''Opened while its module is imported.'''",
+    )
+    (tmp_path / "opens_1.py").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(tmp_path)
+    mine = importlib.import_module("opens_1").Mine()
+    algorithm = Neuroevolution(mine, MLP((2,)), population_size=10, episodes=1, test_episodes=1)
+    jobs = [local.Job(tmp_path / f"{seed}", algorithm, seed, FIVE) for seed in (0, 1)]
+    local.run(jobs, 2)
+    assert all(job.finished() for job in jobs)

@@ -16,6 +16,8 @@ from credo.algorithms.merl import MERL
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.algorithms.off_policy import OffPolicy
 from credo.algorithms.ppo import PPO
+from credo.analysis import bounds
+from credo.environments.extended_tmaze import ExtendedTMaze
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy
 from credo.environments.rover import Rover
@@ -282,3 +284,26 @@ def test_failed_episodes_are_left_out_and_counted(run, monkeypatch):
         "    agent 1        2",
         "  steps            5.0",
     ]
+
+
+def test_a_page_about_a_strangers_run_imports_nothing(page_of, tmp_path, monkeypatch):
+    """Its task is Credo's, and a field of the task is a class of a module that leaves a mark."""
+    (tmp_path / "payload_1.py").write_text(f"open({str(tmp_path / 'mark')!r}, 'w')\nclass X: ...")
+    monkeypatch.syspath_prepend(tmp_path)
+    run = fake(tmp_path / "run", ALGORITHM, 0, [0.5, 0.7])
+    record = json.loads((run / "config.json").read_text())
+    record["algorithm"]["env"]["depth"] = {"class": "payload_1:X"}
+    files.write_json(run / "config.json", record)
+    assert page_of(run).sections
+    assert not (tmp_path / "mark").exists()
+
+
+def test_bounds_are_of_the_task_itself_and_of_none_that_derives_from_it():
+    class Mine(SequenceClassification):
+        """May pay other rewards."""
+
+    assert bounds.exact(SequenceClassification(depth=2))
+    assert not bounds.exact(Mine(depth=2))
+    assert not bounds.exact(ExtendedTMaze(depth=2, robots=2, objective="converge"))
+    assert bounds.exact(ExtendedTMaze(depth=2, robots=2, partner=None))
+    assert not bounds.exact(None)

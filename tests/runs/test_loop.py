@@ -507,6 +507,12 @@ def test_what_a_killed_start_left_behind_is_replaced(tmp_path):
     assert fresh.metrics["generation"].tolist() == [1, 2]
 
 
+def test_a_run_may_lie_in_a_folder_that_is_called_checkpoints(tmp_path):
+    path = tmp_path / "checkpoints"
+    assert train(path, generations=1).metrics["generation"].tolist() == [1]
+    assert resume(path, generations=2).metrics["generation"].tolist() == [1, 2]
+
+
 def tree(path) -> dict[str, bytes | None]:
     """Every file and folder in a folder, with what is in it."""
     return {

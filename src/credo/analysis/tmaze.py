@@ -131,9 +131,19 @@ def baselines(env: ExtendedTMaze) -> dict[str, float]:
     """Shares of trials that take no learning, for one learning robot or for a team without memory.
 
     The static robot's own share is one in Spread alone, where it counts without company.
+
+    **Raises:** `ValueError` for a team beside a static robot, of which none is known.
     """
+    if env.robots > 1 and env.partner is not None:
+        raise ValueError(
+            f"{env.robots} robots beside {env.partner!r}: baselines are known of one robot beside "
+            "a static one, and of teams alone (partner=None)"
+        )
     if env.robots > 1:
-        # Every endpoint is as likely as any other; without memory there are the first and the last.
+        # Every endpoint is as likely as any other; without memory there are the first and the last,
+        # and in Converge all must be at the same one.
+        if env.objective == "converge":
+            return {"all at one end": 1 / env.endpoints}
         return {"one at each end": min(2, env.robots) / env.endpoints}
     named = memoryless(env)
     if env.partner is not None and env.objective == "spread":

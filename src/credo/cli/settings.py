@@ -41,6 +41,8 @@ def read(path: str, *, trust: bool) -> list[tuple[str, list[str]]]:
     for name, values in found:
         if name.replace("-", "_") in OWN:
             fail(f"{path} sets --{name}, which is for the command line alone")
+        if name in ("algorithm", "task") and len(values) != 1:
+            fail(f"{path} sets {name} to {values}: give one word")
         for value in values if not trust else ():
             team = name == "task" and "." in value and not value.startswith(OWN_TEAMS)
             if team or ":" in value or "\\" in value:  # an escape may hide a colon

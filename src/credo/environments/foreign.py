@@ -197,7 +197,7 @@ class ForeignCopies(AbstractCopies):
         **Raises:** `UnfitEnvironment` if the environment cannot be opened as this task."""
         if self._backend is None:
             env, spec = self._env, self._env.spec()
-            processes.allow()
+            processes.allow("opens a task", opening=True)
             try:
                 if env.here:
                     self._backend = worker.Environments(spec, self.n)

@@ -26,6 +26,7 @@ LONGEST = 5.0  # seconds that a guardian gets to kill what it guards
 MULTIPLYING = "put it under if __name__ == '__main__'"
 
 _worker = False  # whether this process is a child, started here
+_opening = True  # whether code that is imported here may start children
 _forked = False  # whether it was forked from one in which JAX has threads
 
 
@@ -40,16 +41,17 @@ class Refused(RuntimeError):
         return f"{self.what}: {self.fix}"
 
 
-def allow(doing: str = "starts training") -> None:
-    """Raise `Refused` where training, or a child of ours, would multiply or never end: while a
-    child imports the user's script, and in a process forked after JAX was used."""
+def allow(doing: str = "starts training", *, opening: bool = False) -> None:
+    """Raise `Refused` where training, or a child of ours (`opening`), would multiply or never end:
+    while a child imports the user's script, and in a process forked after JAX was used."""
     if _forked:
         raise Refused(
             "this process was forked after JAX was used, and JAX would wait in it for ever",
             "start it afresh, as multiprocessing does with the method 'spawn' or 'forkserver', or "
             "use Credo in it alone",
         )
-    frame, script = sys._getframe() if _worker else None, None
+    multiplies = _worker and not (opening and _opening)
+    frame, script = sys._getframe() if multiplies else None, None
     while frame is not None:
         if frame.f_code.co_name == "<module>" and frame.f_back is not None:
             script = script or pathlib.Path(frame.f_code.co_filename).stem
@@ -76,15 +78,23 @@ class Child(subprocess.Popen):
     It finds modules where this process does. Whoever holds it calls `end`.
 
     **Arguments:** `grace`, seconds that the child gets after SIGTERM when this process is gone or
-    ends it by force; 0 kills it at once. `options` are those of `subprocess.Popen`.
+    ends it by force; 0 kills it at once. `opening`: whether modules of users may start children of
+    their own while the child imports them. `options` are those of `subprocess.Popen`.
     """
 
-    def __init__(self, module: str, *arguments: str, grace: float = 0.0, **options: Any):
-        allow()
+    def __init__(
+        self,
+        module: str,
+        *arguments: str,
+        grace: float = 0.0,
+        opening: bool = False,
+        **options: Any,
+    ):
+        allow("opens a task", opening=True)
         self._owner = os.getpid()
         self.ending = None
         path = json.dumps([os.path.abspath(entry) for entry in sys.path])
-        told = [module, path, str(grace), str(self._owner), *arguments]
+        told = [module, path, str(grace), str(self._owner), str(int(opening)), *arguments]
         options = {"stdin": subprocess.DEVNULL, "start_new_session": True} | options
         super().__init__([sys.executable, "-P", os.path.abspath(__file__), *told], **options)
         self._grace = grace
@@ -130,7 +140,9 @@ def _control(option: int, value: int) -> None:
         ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
 
 
-def _guardian(module: str, path: str, grace: str, parent: str, *arguments: str) -> None:
+def _guardian(
+    module: str, path: str, grace: str, parent: str, opening: str, *arguments: str
+) -> None:
     """Run the child, and in this process guard it. Only the child returns."""
     mine = os.getpid()
     _control(PR_SET_CHILD_SUBREAPER, 1)
@@ -145,7 +157,7 @@ def _guardian(module: str, path: str, grace: str, parent: str, *arguments: str) 
         signal.set_wakeup_fd(-1)
         os.close(wake)
         os.close(tell)
-        _run(mine, module, path, arguments)
+        _run(mine, module, path, opening == "1", arguments)
         return
     _let_go(wake, tell)
     status = None
@@ -155,7 +167,7 @@ def _guardian(module: str, path: str, grace: str, parent: str, *arguments: str) 
     _end_like(status)
 
 
-def _run(guardian: int, module: str, path: str, arguments: tuple[str, ...]) -> None:
+def _run(guardian: int, module: str, path: str, opening: bool, arguments: tuple[str, ...]) -> None:
     """In the child: its own group, which ends with the guardian, and then what it is for."""
     for number in (signal.SIGCHLD, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)
@@ -166,7 +178,7 @@ def _run(guardian: int, module: str, path: str, arguments: tuple[str, ...]) -> N
     sys.path[:] = json.loads(path)
     sys.argv = [module, *arguments]
     here: Any = importlib.import_module("credo.environments.processes")
-    here._worker = True
+    here._worker, here._opening = True, opening
     importlib.import_module(module).main()
 
 

@@ -270,14 +270,14 @@ class _Crew:
 
     def end(self) -> None:
         """End all workers at once, and whatever they started."""
-        for one in self.under_way:
-            _kill(one.process)
+        _kill(*[one.process for one in self.under_way])
 
 
 def _start(core: int) -> Child:
     """A worker that computes on this core alone."""
     pipe = subprocess.PIPE
-    return Child(worker.__name__, str(core), grace=SAVE, stdin=pipe, stdout=pipe, text=True)
+    how = {"grace": SAVE, "opening": True}
+    return Child(worker.__name__, str(core), **how, stdin=pipe, stdout=pipe, text=True)
 
 
 def _answer(process: Any) -> dict[str, Any]:
@@ -300,10 +300,14 @@ def _end(process: Any) -> None:
         process.stdout.close()
 
 
-def _kill(process: Any) -> None:
-    """End a worker at once, and whatever it started: its guardian waits only if it is told once."""
+def _kill(*processes: Any) -> None:
+    """End workers at once, and whatever they started: guardians wait only if they are told once."""
     for _ in range(100):
-        if process.over(0.05):
+        left = [process for process in processes if not process.over(0.0)]
+        if not left:
             break
-        process.terminate()
-    process.end(0.0)
+        for process in left:
+            process.terminate()
+        left[0].over(0.05)
+    for process in processes:
+        process.end(0.0)

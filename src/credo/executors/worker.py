@@ -6,6 +6,7 @@ under way is saved (see `environments.processes`). A job is what `Job.message` s
 stderr.
 """
 
+import contextlib
 import json
 import os
 import pathlib
@@ -37,7 +38,8 @@ def main() -> None:
             answer, stop = {"error": str(error)}, error.code
         except Exception as error:  # the parent reports it
             answer = {"error": f"{type(error).__name__}: {error}"}
-        print(json.dumps(answer), file=answers, flush=True)
+        with contextlib.suppress(BrokenPipeError):  # the parent is gone; what was saved stays
+            print(json.dumps(answer), file=answers, flush=True)
         if stop is not None:
             raise SystemExit(stop)
 

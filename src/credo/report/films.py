@@ -60,28 +60,29 @@ def _gif(path: pathlib.Path, rate: float) -> Iterator[Add]:
 @contextlib.contextmanager
 def _mp4(path: pathlib.Path, rate: float) -> Iterator[Add]:
     """An H.264 video; ffmpeg takes each picture as it comes. The first one tells the size."""
-    process: subprocess.Popen[bytes] | None = None
+    with tempfile.TemporaryFile() as said:  # a pipe that is not read could fill and stop it
+        process: subprocess.Popen[bytes] | None = None
 
-    def add(picture: np.ndarray) -> None:
-        nonlocal process
-        height, width = (n - n % 2 for n in picture.shape[:2])  # colours are for 2 x 2 pixels
-        process = process or _ffmpeg(path, rate, f"{width}x{height}")
-        assert process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # if it ends early it says why
-            process.stdin.write(np.ascontiguousarray(picture[:height, :width]).data)
+        def add(picture: np.ndarray) -> None:
+            nonlocal process
+            height, width = (n - n % 2 for n in picture.shape[:2])  # colours are for 2 x 2 pixels
+            process = process or _ffmpeg(path, rate, f"{width}x{height}", said)
+            assert process.stdin is not None
+            with contextlib.suppress(BrokenPipeError):  # if it ends early it says why
+                process.stdin.write(np.ascontiguousarray(picture[:height, :width]).data)
 
-    told = b""
-    try:
-        yield add
-    finally:
-        if process is not None:
-            _, told = process.communicate()
-    if process is not None and process.returncode != 0:
-        words = told.decode(errors="replace").strip()
-        raise RunError(f"cannot write {path}: ffmpeg says {words!r}; or ask for a .gif")
+        try:
+            yield add
+        finally:
+            if process is not None:
+                process.communicate()
+        if process is not None and process.returncode != 0:
+            said.seek(0)
+            words = said.read().decode(errors="replace").strip()
+            raise RunError(f"cannot write {path}: ffmpeg says {words!r}; or ask for a .gif")
 
 
-def _ffmpeg(path: pathlib.Path, rate: float, size: str) -> subprocess.Popen[bytes]:
+def _ffmpeg(path: pathlib.Path, rate: float, size: str, said: Any) -> subprocess.Popen[bytes]:
     """A process that makes `path` of what it is given. Not started by imageio_ffmpeg, which would
     fork: JAX must not be forked."""
     import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
@@ -89,7 +90,7 @@ def _ffmpeg(path: pathlib.Path, rate: float, size: str) -> subprocess.Popen[byte
     source = f"-v error -f rawvideo -pix_fmt rgb24 -s {size} -r {rate} -i -".split()
     target = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-y"]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), *source, *target, str(path.absolute())]
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=said)
 
 
 @contextlib.contextmanager

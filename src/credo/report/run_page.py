@@ -237,10 +237,7 @@ def _curve(label: str, group: list[Run], metric: str, unit: str) -> Curve:
 def _bounds(group: list[Run]) -> tuple[Reference, Reference] | None:
     """The best baseline and the upper bound of a run's task, where they are known exactly. No
     other task is made: that might run code of others."""
-    recorded = group[0].config["algorithm"]["env"]
-    if recorded["class"] not in map(config.class_name, bounds.EXACT):
-        return None
-    task = config.from_tree(recorded)
+    task = group[0].part("env")
     if not bounds.exact(task):
         return None
     name, value = bounds.best_baseline(task)

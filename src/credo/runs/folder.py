@@ -79,10 +79,11 @@ def new_folder(path: pathlib.Path) -> Iterator[None]:
 
 def _left(folder: pathlib.Path, path: pathlib.Path) -> bool:
     """Whether something in a folder was left by a process that died before its run began."""
-    name = path.relative_to(folder).as_posix()
+    relative = path.relative_to(folder)
+    name = relative.as_posix()
     if path.is_symlink() or not LEFT.fullmatch(name):
         return False
-    if name == "checkpoints" or path.parent.name == "checkpoints":
+    if relative.parts[0] == "checkpoints" and len(relative.parts) < 3:
         return path.is_dir()
     return path.is_file() and (name != "lock" or is_lock(path))
 
