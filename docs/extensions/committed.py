@@ -15,7 +15,10 @@ BEGIN, END = "<!-- table: python docs/extensions/committed.py -->\n", "<!-- end 
 
 def table() -> str:
     """A row for each experiment and budget, and one for each experiment without data."""
-    lines = ["| experiment | | budget | cells | seeds per cell | |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| experiment | what it shows | budget | cells | seeds per cell | files |",
+        "|---|---|---|---|---|---|",
+    ]
     for name, title in EXPERIMENTS.items():
         found = sorted((ROOT / "results" / name).glob("*/results.json"))
         if not found:

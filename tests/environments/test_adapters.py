@@ -1,12 +1,15 @@
 """What an environment of others says is read by one rule, and what it must not say is named."""
 
+import dataclasses
 import re
 import warnings
 
+import jax
 import numpy as np
 import pytest
 
-from credo.environments import checks
+from credo.algorithms.off_policy import OffPolicy
+from credo.environments import checks, foreign
 from credo.environments.adapters import Single
 from credo.environments.foreign import close_all
 from credo.environments.gymnasium import Gymnasium
@@ -18,6 +21,11 @@ from credo.environments.wrappers import delayed
 def _workers_end():
     yield
     close_all()
+
+
+@pytest.fixture(autouse=True)
+def _nothing_was_said_before(monkeypatch):
+    monkeypatch.setattr(foreign, "_WARNED", set())
 
 
 def here(name, steps=6, **kwargs):
@@ -131,10 +139,14 @@ def test_a_mask_that_allows_nothing_is_a_fault_but_at_the_end():
 
 def test_without_a_time_limit_an_episode_is_cut_and_that_is_said():
     env = Gymnasium("broken:Tiny", in_process=True)
-    with pytest.warns(UserWarning, match=r"Tiny: it names no time limit: .* after 1,000 steps"):
-        assert env.max_steps == 1000
+    told = r"Tiny: it names no time limit: .* after 1,000 steps"
+    with pytest.warns(UserWarning, match=told) as seen:
+        OffPolicy.td3(env).init(key=jax.random.key(0))
+    assert [w.filename for w in seen] == [__file__]  # the line of the user's
+    assert env.max_steps == 1000
     with warnings.catch_warnings(action="error"):  # once
         assert env.copies(2).n == 2
+        assert dataclasses.replace(env, timeout=7.0).max_steps == 1000
         assert checks.check_environment(env) == []
     assert len(checks.examine(env)[1]) == 1
 

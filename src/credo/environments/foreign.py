@@ -160,11 +160,21 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
         return tuple(self._sizes()["warnings"])
 
     def _warn(self) -> None:
-        """Warn of what users should know, once for each task and process."""
-        if self not in _WARNED:
-            _WARNED.add(self)
-            for told in self.warnings:
-                warnings.warn(f"{self.id}: {told}", stacklevel=4)
+        """Warn of what users should know, once in a process."""
+        for told in (f"{self.id}: {told}" for told in self.warnings):
+            if told not in _WARNED:
+                _WARNED.add(told)
+                warnings.warn(told, stacklevel=_level_of_user())
+
+
+def _level_of_user() -> int:
+    """The `stacklevel` of a warning given by who calls this, for the line of the user's that led
+    to it: the nearest one outside Credo and of what calls functions for it."""
+    level, frame = 1, sys._getframe(1)
+    inside = (__name__.partition(".")[0], "contextlib", "equinox", "jax")
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in inside:
+        level, frame = level + 1, frame.f_back
+    return level
 
 
 class ForeignCopies(AbstractCopies):
@@ -355,7 +365,7 @@ def _form(x: np.ndarray, shape: tuple[int, ...], dtype: type) -> np.ndarray:
 
 
 RECORDED = ("obs_size", "action_size", "agents", "discrete", "actions", "observations", "names")
-_WARNED: set[AbstractForeignEnvironment] = set()
+_WARNED: set[str] = set()
 
 
 class _Kept(threading.local):
