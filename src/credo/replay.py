@@ -40,21 +40,23 @@ class Sampling(eqx.Module):
         if isinstance(self.half_life, int | float) and not self.half_life > 0:
             raise ValueError(f"half_life is {self.half_life}: it must be above 0, or None")
 
-    def draw(
-        self, replay: "Replay", shape: tuple[int, ...], *, key: PRNGKeyArray
-    ) -> Int[Array, "..."]:
-        """Rows of a buffer, with replacement."""
+    def draw(self, replay: "Replay", shape: tuple[int, ...], *, key: PRNGKeyArray) -> Array:
+        """Numbers of rows of a buffer, with replacement."""
         size = jnp.maximum(replay.size, 1)
         if self.half_life is None:
             return jax.random.randint(key, shape, 0, size)
+        return self._recent(replay, jax.random.uniform(key, shape), size)
+
+    def _recent(self, replay: "Replay", u: Array, size: Array) -> Array:
         # The inverse of the distribution function of an exponential that ends at the oldest row.
         oldest = 1.0 - jnp.exp2(-size.astype(jnp.float32) / self.half_life)
-        age = -self.half_life * jnp.log2(1.0 - jax.random.uniform(key, shape) * oldest)
+        age = -self.half_life * jnp.log2(1.0 - u * oldest)
         age = jnp.minimum(age.astype(jnp.int32), size - 1)
         return (replay.position - 1 - age) % replay.capacity
 
 
 UNIFORM = Sampling()
+Sampled = tuple[Transition, Any]  # and the discount behind each, or None
 
 
 class Replay(eqx.Module):
@@ -101,15 +103,7 @@ class Replay(eqx.Module):
         data = jax.tree.map(lambda old, new: old.at[slot].set(new, mode="drop"), self.data, rows)
         return Replay(data, self.written + n)
 
-    def sample(
-        self,
-        n: int,
-        sampling: Sampling = UNIFORM,
-        gamma: float | Float[Array, ""] = 1.0,
-        *,
-        together: bool = False,
-        key: PRNGKeyArray,
-    ) -> tuple[Transition, Float[Array, "n *agents"] | None]:
+    def sample(self, n: int, sampling=UNIFORM, gamma: Any = 1.0, *, together=False, key) -> Sampled:
         """`n` transitions with replacement, and `gamma` to the number of steps that each spans;
         None if that is one. There must be at least one row.
 
@@ -119,8 +113,10 @@ class Replay(eqx.Module):
         team = self.data.action.shape[1:-1]
         index = sampling.draw(self, (n,) if together else (n, *team), key=key)
         rows = self._rows(index)
-        if sampling.steps == 1:
-            return rows, None
+        return (rows, None) if sampling.steps == 1 else self._followed(rows, index, sampling, gamma)
+
+    def _followed(self, rows: Transition, index: Int[Array, "n *agents"], sampling, gamma):
+        """Rows that go on for several steps, and the discount behind each."""
         discount = jnp.full(rows.terminated.shape, gamma)
         on = jnp.ones(rows.terminated.shape, bool)
         for step in range(1, sampling.steps):

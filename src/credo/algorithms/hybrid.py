@@ -223,33 +223,33 @@ def balance(hybrid: Hybrid, state: HybridState, fitness: Fitness) -> HybridState
 
 
 def teach(hybrid: Hybrid, state: HybridState, frames: Frames, *, keys: tuple[Key, Key]) -> Result:
-    """The learners play and improve, in rounds, until they have had their share of all frames
-    beside the population's `frames`; without shares one round."""
-    explore_key, learn_key = keys
-    wanted = state.share / (1.0 - state.share) * frames.astype(jnp.float32)
-    state, explored = explore(hybrid, state, frames, key=explore_key)
-    theirs = explored["frames"] - frames
-    state, learned = improve(hybrid, state, explored["frames"], hybrid.rounds, key=learn_key)
-    metrics = explored | learned
+    """The learners play, and improve by what they and the population played (its `frames`); with a
+    `share` of the hybrid again and again, until they have had it."""
+    state, explored = explore(hybrid, state, frames, key=keys[0])
+    state, learned = improve(hybrid, state, explored["frames"], hybrid.rounds, key=keys[1])
     if hybrid.share is None or not hybrid.learners:
-        return state, metrics
+        return state, explored | learned
+    return _until_shared(hybrid, state, explored | learned, frames, keys=keys)
+
+
+def _until_shared(hybrid: Hybrid, state: HybridState, metrics: Metrics, frames: Frames, *, keys):
+    """`teach` from its second round on."""
+    wanted = state.share / (1.0 - state.share) * frames.astype(jnp.float32)
 
     def due(loop) -> Bool[Array, ""]:
-        return loop[1].astype(jnp.float32) < wanted
+        return (loop[1]["frames"] - frames).astype(jnp.float32) < wanted
 
     def again(loop):
-        state, theirs, metrics, turn = loop
+        state, before, turn = loop
         fresh = [jax.random.fold_in(key, len(hybrid.learners) + turn) for key in keys]
         state, explored = explore(hybrid, state, jnp.int32(0), key=fresh[0])
-        new = explored["frames"]
-        state, learned = improve(hybrid, state, new, hybrid.workers, key=fresh[1])
-        summed = {
-            name: metrics[name] + (explored | learned)[name] for name in ("frames", "updates")
-        }
-        return state, theirs + new, metrics | explored | learned | summed, turn + 1
+        state, learned = improve(hybrid, state, explored["frames"], hybrid.workers, key=fresh[1])
+        metrics = before | explored | learned
+        summed = {name: before[name] + metrics[name] for name in ("frames", "updates")}
+        return state, metrics | summed, turn + 1
 
-    state, _, metrics, turns = repeat(due, again, (state, theirs, metrics, jnp.int32(0)))
-    return state, metrics | {"learner_share": state.share, "learner_rounds": turns + 1}
+    state, metrics, rounds = repeat(due, again, (state, metrics, jnp.int32(1)))
+    return state, metrics | {"learner_share": state.share, "learner_rounds": rounds}
 
 
 def improve(

@@ -15,11 +15,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from ..compilation import jit
 from ..networks.base import AbstractNetwork, AbstractPolicy
-from ..normalization import Moments, seen
-from ..replay import UNIFORM, Replay, Sampling
+from ..normalization import seen
+from ..replay import UNIFORM, Replay
 from ..types import NOTHING, Batch, Metrics
 
 Learned = tuple[PyTree, Metrics]  # state and metrics
+Returns = Float[Array, "samples batch *agents"]
 
 
 class AbstractLearner(eqx.Module):
@@ -62,9 +63,7 @@ class AbstractLearner(eqx.Module):
         """`state` that goes on from a given actor."""
 
 
-def learn(
-    learner: AbstractLearner, state, replay: Replay, updates, sampling: Sampling = UNIFORM, **rest
-) -> Learned:
+def learn(learner: AbstractLearner, state, replay: Replay, updates, **rest) -> Learned:
     """`updates` gradient steps, each on a minibatch of its own, in one program. Their number is
     data.
 
@@ -76,26 +75,14 @@ def learn(
     if not isinstance(updates, jax.core.Tracer) and updates == 0:
         # Nothing need be compiled for it: the first fitness of a run comes sooner.
         return state, {name: jnp.float32(NOTHING) for name in learner.metrics}
-    return _learn(learner, state, replay, updates, sampling=sampling, **rest)
+    return _learn(learner, state, replay, updates, **rest)
 
 
 @jit
-def _learn(
-    learner,
-    state,
-    replay: Replay,
-    updates,
-    *,
-    signal,
-    moments: Moments | None = None,
-    sampling: Sampling,
-    key,
-):
-    dynamic, static = eqx.partition(state, eqx.is_array)
+def _learn(learner, state, replay: Replay, updates, *, signal, moments=None, sampling=UNIFORM, key):
     signal = learner.signal or signal
-    if learner.reward_scale is None:
-        usual = jnp.maximum(replay.spread(signal), 1e-8)
-        learner = replace(learner, reward_scale=jnp.maximum(1.0 - learner.gamma, 1e-4) / usual)
+    learner = learner if learner.reward_scale is not None else _scaled(learner, replay, signal)
+    dynamic, static = eqx.partition(state, eqx.is_array)
 
     def body(i, loop):
         dynamic, total = loop
@@ -113,17 +100,16 @@ def _learn(
     return eqx.combine(dynamic, static), averaged(total, updates)
 
 
-def bellman(
-    learner: AbstractLearner,
-    batch: Batch,
-    after: Float[Array, "samples batch *agents"],
-    ended: Bool[Array, "batch *agents"],
-) -> Float[Array, "samples batch *agents"]:
+def _scaled(learner: Any, replay: Replay, signal: str) -> Any:
+    """With the scale at which the usual reward, paid at every step, makes a return of 1."""
+    usual = jnp.maximum(replay.spread(signal), 1e-8)
+    return replace(learner, reward_scale=jnp.maximum(1.0 - learner.gamma, 1e-4) / usual)
+
+
+def bellman(learner: AbstractLearner, batch: Batch, after: Returns, ended: Array) -> Returns:
     """Reward and discounted value of the next state: what returns are worth of which `after` is a
-    sample there, unless the episode `ended`."""
-    scale = learner.reward_scale
-    assert scale is not None, "`learn` puts a number in place of None"
-    reward = (scale * batch.reward)[None]
+    sample there, unless the episode `ended`. `learn` puts a number where `reward_scale` is None."""
+    reward = (learner.reward_scale * batch.reward)[None]  # pyright: ignore[reportOptionalOperand]
     discount = learner.gamma if batch.discount is None else batch.discount[None]
     return reward + discount * jnp.where(ended[None], 0.0, after)
 

@@ -25,11 +25,10 @@ from ..networks.mlp import (
     linear,
 )
 from ..types import Batch, Metrics
-from .base import AbstractLearner, adam, adam_state, bellman, descend, polyak
+from .base import AbstractLearner, Returns, adam, adam_state, bellman, descend, polyak
 
 Key = PRNGKeyArray
 Scalar = Float[Array, ""]
-Returns = Float[Array, "samples batch"]
 Critics = tuple[AbstractCriticNetwork, ...]
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # of the authors' code
 

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from .. import require
 from ..networks.base import AbstractNetwork, AbstractPolicy
@@ -23,6 +23,7 @@ from ..networks.team import JointCritic, TeamPolicy
 from ..types import Batch, Metrics
 from .base import (
     AbstractLearner,
+    Returns,
     act,
     adam_state,
     bellman,
@@ -51,7 +52,6 @@ ERL_NETWORK = MLP(hidden=(128, 128), normalization="before", initializer="unifor
 
 Key = PRNGKeyArray
 Critics = tuple[AbstractCriticNetwork, ...]
-Returns = Float[Array, "samples batch *agents"]
 
 
 class TD3State(eqx.Module):
