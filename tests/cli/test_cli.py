@@ -854,14 +854,15 @@ def test_a_run_that_ends_before_it_learns_is_mentioned(credo, tmp_path):
     words = "train td3 Pendulum-v1 --frames 250 --test-episodes 1 --network.hidden 4 --path"
     code, _, err = credo(*words.split(), str(tmp_path / "a"))
     assert code == 0
-    assert "nothing is learned by gradient in the first 25,000 frames" in err
+    assert "learning by gradient begins with the generation after 25,000 frames" in err
     assert "fewer --start-frames" in err
-    assert f"credo: no gradient update was made in {tmp_path / 'a'}: nothing is" in err
+    assert f"credo: no gradient update was made in {tmp_path / 'a'}: learning by" in err
     _, _, err = credo(*words.split(), str(tmp_path / "b"), "--start-frames", "200")
     assert "nothing is learned" not in err
     assert "no gradient update" not in err
 
 
+@pytest.mark.filterwarnings("ignore:.*names no time limit")
 def test_a_task_is_checked_with_the_flags_it_is_given(credo, own_tasks):
     task = f"{own_tasks}:Crumbling"
     assert "its floor gave way" in credo("check", task)[1]
@@ -1009,3 +1010,47 @@ def test_ctrl_c_ends_a_command_without_taking_python_apart():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "begun\n", "credo: stopped\n")
+
+
+EXTRAS = "pettingzoo,mpe2,mujoco,imageio_ffmpeg,tensorboardX,wandb,trackio,shtab,sphinx"
+WITHOUT = """
+import sys
+for name in sys.argv[1].split(","):
+    sys.modules[name] = None
+from credo.cli import main
+main(sys.argv[2:])
+"""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "train erl --help",
+        "train merl rover --help-all",
+        "train neuroevolution sequence-recall --generations 1 --population-size 10 --path run",
+        "check sequence-recall",
+        "list tasks",
+        "list",
+    ],
+)
+def test_the_base_install_is_enough(words, tmp_path):
+    """None of the extras can be imported here."""
+    told = subprocess.run(
+        [sys.executable, "-c", WITHOUT, EXTRAS, *words.split()],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert (told.returncode, told.stderr.count("Traceback")) == (0, 0), told.stderr
+
+
+def test_a_hybrid_whose_learners_never_joined_says_so(credo, tmp_path):
+    short = "--warmup-frames 1 --updates-per-frame 0.05 --population-size 4 --elite-fraction 0.25"
+    short += " --replay-capacity 2000 --batch-size 8"
+    told = "is evolution alone: its learners join the population every 2 generations"
+    for generations, said in ((2, True), (3, False)):
+        words = f"train erl Pendulum-v1 --generations {generations} --sync-period 2 {short}"
+        code, _, err = credo(f"{words} --path {tmp_path / str(generations)}")
+        assert (code, told in err) == (0, said), err

@@ -185,7 +185,7 @@ class Line:
         else:
             for flag in [known[name] for name in CATALOGUE["screen"]["first"] if name in known]:
                 print(flag.help(re.split(r"(?<=[\w`)\]])(?<!^\w)[.:;] ", flag.text)[0]))
-            print(f"\n--help-all lists every field: {len(known)} flags.")
+            print("\n--help-all lists every field.")
         raise SystemExit(0 if self.help else 2)
 
 

@@ -12,13 +12,16 @@ from ..environments import checks, names
 from ..environments.base import AbstractEnvironment
 from ..environments.gymnasium import Gymnasium
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
-from ..environments.pettingzoo import PettingZoo
 from ..require import suggestion
+from ..runs import config
 from ..runs.ending import first, place, say
 from .names import CATALOGUE, TASKS, fail, load, of_user
 from .values import pairs
 
-KINDS = {"gymnasium": Gymnasium, "pettingzoo": PettingZoo}
+KINDS = {  # those of PettingZoo need an extra
+    kind: f"environments.{kind}:{name}"
+    for kind, name in (("gymnasium", "Gymnasium"), ("pettingzoo", "PettingZoo"))
+}
 
 
 def task(name: str, kwargs: dict[str, Any], rewards: tuple[str, ...]) -> Any:
@@ -44,7 +47,7 @@ def with_settings(env: Any, kwargs: dict[str, Any], rewards: tuple[str, ...] = (
     if kwargs:
         new["kwargs"] = dict(env.kwargs) | kwargs
     if rewards:
-        own = isinstance(env, PettingZoo)
+        own = config.class_name(type(env)) == f"credo.{KINDS['pettingzoo']}"
         new["rewards"] = dict(env.rewards) | pairs("rewards", [*rewards]) if own else rewards
     return dataclasses.replace(env, **new)
 
@@ -59,7 +62,7 @@ def _named(name: str, kwargs: dict[str, Any]) -> Any:
     if re.fullmatch(r"\w+(\.\w+)+", name):
         with contextlib.suppress(ModuleNotFoundError):  # of what stands before the last dot
             if importlib.util.find_spec(name):
-                return PettingZoo(id=name)
+                return load(KINDS["pettingzoo"])(id=name)
         own = ":".join(name.rsplit(".", 1))
         fail(f"no module {name!r}: a class or function of your own is written {own}")
     if match := re.fullmatch(r"(?:\./)?(\w+)\.py:(\w+)", name):  # a file in place of its module
@@ -100,7 +103,7 @@ def _own(name: str, kwargs: dict[str, Any]) -> Any:
             f"{name} is no task: derive it from credo.AbstractEnvironment or gymnasium.Env, or "
             "name a function that makes a gymnasium.Env or a pettingzoo.ParallelEnv"
         )
-    return KINDS[kind](id=name)
+    return load(KINDS[kind])(id=name)
 
 
 def require_sound(name: str, env: Any) -> None:

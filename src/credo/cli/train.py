@@ -14,6 +14,8 @@ from ..runs.options import RunOptions
 from .line import Line
 from .names import ALGORITHMS, CATALOGUE, NETWORKS, fail, load
 
+FEW = 5  # generations
+
 
 @dataclasses.dataclass
 class Train:
@@ -179,6 +181,7 @@ def _start(command: Train, algorithm: Any) -> None:
     first, late = _warm_up(algorithm)
     if not start and options.frames is not None and options.frames <= first:
         say(f"credo: note: {late}")
+    _note_few(algorithm, options)
     if command.seeds == 1:
         runs = [loop.train(algorithm, options, seed=command.seed, path=path, warm_start=start)]
     else:
@@ -190,8 +193,34 @@ def _start(command: Train, algorithm: Any) -> None:
         print(run.summary)
         if late and not run.metrics["updates"].any():
             say(f"credo: no gradient update was made in {run.path}: {late}")
+        elif told := _without_injection(algorithm, run):
+            say(f"credo: {told}")
     if len(runs) > 1:
         print(f"compare them: credo report {path}/seed-*")
+
+
+def _note_few(algorithm: Any, options: RunOptions) -> None:
+    """Say so if a budget in frames may be used up within a few generations of a population."""
+    most, size = getattr(algorithm, "most_frames", None), getattr(algorithm, "population_size", 0)
+    if options.frames and most and size and options.frames < FEW * most:
+        least = -(-options.frames // most)
+        say(
+            f"credo: note: a generation takes up to {most:,} frames, so this run may have "
+            f"{'one generation' if least == 1 else f'{least} generations'} only: give more --frames"
+        )
+
+
+def _without_injection(algorithm: Any, run: Any) -> str:
+    """What to know of a hybrid whose learners never joined its population; "" of any other run."""
+    for name in ("sync_period", "migration_period"):
+        period, done = getattr(algorithm, name, 0), int(run.metrics["generation"][-1])
+        if getattr(algorithm, "learners", ()) and done <= period:
+            return (
+                f"{run.path} is evolution alone: its learners join the population every {period} "
+                f"generations, and it made {done}: give more --frames, or fewer "
+                f"--{name.replace('_', '-')}"
+            )
+    return ""
 
 
 def _warm_up(algorithm: Any) -> tuple[int, str]:
@@ -200,6 +229,6 @@ def _warm_up(algorithm: Any) -> tuple[int, str]:
     for name in ("start_frames", "warmup_frames"):
         if hasattr(algorithm, name) and getattr(algorithm, "learners", True):
             frames, flag = getattr(algorithm, name), name.replace("_", "-")
-            told = f"nothing is learned by gradient in the first {frames:,} frames"
+            told = f"learning by gradient begins with the generation after {frames:,} frames"
             return frames, f"{told}: give more --frames, or fewer --{flag}"
     return -1, ""

@@ -11,6 +11,7 @@ import json
 import os
 import pathlib
 import sys
+import warnings
 from typing import Any
 
 
@@ -23,8 +24,10 @@ def main() -> None:
 
     import jax
 
+    from ..runs.ending import say
     from ..runs.loop import Interrupted
 
+    warnings.showwarning = lambda message, *_args, **_kw: say(f"warning: {message}")
     before = None
     for line in sys.stdin:
         job, stop = json.loads(line), None

@@ -36,7 +36,7 @@ def film(path: pathlib.Path, rate: float) -> Iterator[Add]:
     if mp4 and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise RunError(
             f"cannot write {path}: imageio-ffmpeg is not installed; "
-            '`pip install "credo[video]"`, or ask for a .gif'
+            "`pip install imageio-ffmpeg`, or ask for a .gif"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:

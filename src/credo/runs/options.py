@@ -43,7 +43,7 @@ class RunOptions:
 
     loggers: tuple[Literal["wandb", "trackio"], ...] = ()
     """Experiment trackers that get every metric: wandb, trackio. Each is a package of its own:
-    `pip install "credo[wandb]"`."""
+    `pip install wandb`."""
 
     progress: bool = True
     """Whether to show a progress bar, or a line every ten seconds where there is no terminal."""
