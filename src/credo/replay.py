@@ -45,18 +45,20 @@ class Sampling(eqx.Module):
         size = jnp.maximum(replay.size, 1)
         if self.half_life is None:
             return jax.random.randint(key, shape, 0, size)
-        return self._recent(replay, jax.random.uniform(key, shape), size)
-
-    def _recent(self, replay: "Replay", u: Array, size: Array) -> Array:
-        # The inverse of the distribution function of an exponential that ends at the oldest row.
-        oldest = 1.0 - jnp.exp2(-size.astype(jnp.float32) / self.half_life)
-        age = -self.half_life * jnp.log2(1.0 - u * oldest)
-        age = jnp.minimum(age.astype(jnp.int32), size - 1)
-        return (replay.position - 1 - age) % replay.capacity
+        return _recent(replay, self.half_life, size, jax.random.uniform(key, shape))
 
 
 UNIFORM = Sampling()
 Sampled = tuple[Transition, Any]  # and the discount behind each, or None
+
+
+def _recent(replay: "Replay", half_life: float, size: Array, u: Array) -> Array:
+    """Rows whose ages are exponentially distributed up to that of the oldest, by the inverse of
+    their distribution function at `u`, uniform in [0, 1)."""
+    oldest = 1.0 - jnp.exp2(-size.astype(jnp.float32) / half_life)
+    age = -half_life * jnp.log2(1.0 - u * oldest)
+    age = jnp.minimum(age.astype(jnp.int32), size - 1)
+    return (replay.position - 1 - age) % replay.capacity
 
 
 class Replay(eqx.Module):

@@ -34,9 +34,11 @@ from ..evolution.mutation import AbstractMutation
 from ..evolution.selection import AbstractSelection
 from ..learners.base import AbstractLearner
 from ..learners.manager import AbstractManager
+from ..learners.share import AbstractShare
 from ..networks.base import AbstractNetwork
 from ..networks.exploration import AbstractNoise
 from ..networks.mlp import AbstractCritic
+from ..networks.values import AbstractValues
 from ..require import suggestion
 
 EXTENSIONS = (
@@ -50,6 +52,8 @@ EXTENSIONS = (
     AbstractManager,
     AbstractNoise,
     AbstractCritic,
+    AbstractValues,
+    AbstractShare,
 )
 PACKAGES = ("credo", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
 
