@@ -10,10 +10,12 @@ import pytest
 from compilations import compilations
 
 from credo.learners.base import act, adam, adam_state, learn, polyak
+from credo.learners.sac import SAC
 from credo.learners.td3 import TD3
 from credo.networks.base import AbstractPolicy
 from credo.networks.mlp import MLP, Critic
-from credo.replay import Replay
+from credo.networks.values import Histogram, Quantiles
+from credo.replay import Replay, Sampling
 from credo.types import NOTHING, Batch, Transition
 
 NETWORK = MLP(hidden=(3,))
@@ -148,3 +150,41 @@ def test_a_batch_of_actions_is_one_action_after_the_other():
         one_by_one = [np.asarray(policy(x, policy.start(key=None))[0]) for x in obs]
         np.testing.assert_allclose(actions, one_by_one, atol=1e-6)
         assert len(np.unique(actions)) == ROWS
+
+
+def test_transitions_of_several_steps_bootstrap_with_their_own_discount(replay, start):
+    """And rewards are scaled so that the usual one, paid at every step, makes a return of 1."""
+    sampling = Sampling(3, half_life=5.0)
+    learner = dataclasses.replace(LEARNER, reward_scale=None, gamma=0.9)
+    given = {"signal": "a", "sampling": sampling, "key": KEY}
+    learned, _ = learn(learner, start, replay, jnp.int32(1), **given)
+
+    sample_key, update_key = jax.random.split(jax.random.fold_in(KEY, 0))
+    rows, discount = replay.sample(4, sampling, 0.9, key=sample_key)
+    usual = np.sqrt(np.mean(np.asarray(replay.data.rewards["a"]) ** 2))
+    by_hand = dataclasses.replace(learner, reward_scale=0.1 / usual)
+    ends = (rows.terminated, rows.truncated)
+    batch = Batch(rows.obs, rows.action, rows.rewards["a"], rows.next_obs, *ends, None, discount)
+    target = by_hand.bellman_target(start, batch, key=update_key)
+    after = by_hand.bellman_target(
+        start, dataclasses.replace(batch, reward=jnp.zeros(4), discount=jnp.ones(4)), key=update_key
+    )
+    expected = 0.1 / usual * np.asarray(batch.reward) + np.asarray(discount) * np.asarray(after[0])
+    np.testing.assert_allclose(target[0], expected, rtol=1e-5)
+    state, _ = by_hand.update(start, batch, key=update_key)
+    for x, y in zip(jax.tree.leaves(learned), jax.tree.leaves(state), strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-5)
+
+
+@pytest.mark.parametrize("values", [Quantiles(5), Histogram(31, limit=3.0)])
+@pytest.mark.parametrize("kind", [TD3, SAC])
+def test_critics_of_distributions_learn_the_value_of_an_end(kind, values, replay):
+    """Of rows that all end the episode a value is the reward."""
+    data = dataclasses.replace(replay.data, terminated=jnp.ones(ROWS, bool))
+    ended = Replay(data, jnp.int32(ROWS))
+    critic = Critic(hidden=(32,), values=values)
+    learner = kind(critic=critic, actor_lr=0.0, critic_lr=0.01, batch_size=64)
+    state = learner.init(NETWORK, 2, 1, key=jax.random.key(0))
+    state, _ = learn(learner, state, ended, jnp.int32(1500), signal="a", key=KEY)
+    found = state.critics[0](data.obs.T, data.action.T)
+    np.testing.assert_allclose(found, data.rewards["a"], atol=0.15)
