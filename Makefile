@@ -1,10 +1,10 @@
-# Everything a fresh machine with Python >= 3.11 and git needs: `make demo`, `make test`, `make docs`.
+# Everything a fresh machine with Python >= 3.11 and git needs: `make demo`, `make test`, `make test-all`, `make docs`.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 WORKERS ?= auto
 
-.PHONY: demo test docs lint benchmark clean
+.PHONY: demo test test-all docs lint benchmark clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if v >= (3, 11) else f"Credo needs Python 3.11 or newer; $(PYTHON) is {v[0]}.{v[1]}. Try: make PYTHON=python3.12 $(MAKECMDGOALS)")'
@@ -22,7 +22,10 @@ test: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
-	$(BIN)/python -m pytest --numprocesses $(WORKERS)
+	$(BIN)/python -m pytest --numprocesses $(WORKERS) -m "not slow"
+
+test-all: test
+	$(BIN)/python -m pytest --numprocesses $(WORKERS) -m slow
 
 docs: $(VENV)/installed
 	$(BIN)/python -m sphinx -E -W --keep-going -b html docs build/docs

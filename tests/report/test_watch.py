@@ -215,7 +215,7 @@ def test_two_writers_of_one_film_do_not_mix(tmp_path, suffix):
 def test_without_ffmpeg_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     run = made(tmp_path / "run", task())
-    with pytest.raises(RunError, match=r'pip install "credo\[video\]"`, or ask for a \.gif'):
+    with pytest.raises(RunError, match=r"pip install imageio-ffmpeg`, or ask for a \.gif"):
         watch(run, tmp_path / "film.mp4")
 
 
