@@ -16,6 +16,7 @@ print(sum(len(cell.get("outputs", ())) for cell in notebook.cells))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_and_shows_something(path, tmp_path):
     pytest.importorskip("nbclient", reason="nbclient is of the extra dev")

@@ -48,12 +48,14 @@ def site(tmp_path_factory):
     return target / "html"
 
 
+@pytest.mark.slow
 def test_every_public_name_is_in_the_reference(site):
     lines = (site / "objects.inv").read_bytes().split(b"\n", 4)[4]
     known = {line.split()[0] for line in zlib.decompress(lines).decode().splitlines()}
     assert {f"credo.{name}" for name in credo.__all__} <= known
 
 
+@pytest.mark.slow
 def test_docstrings_are_rendered_as_markdown(site):
     page = (site / "generated" / "reference" / "evolution.html").read_text("utf-8")
     assert "<strong>Fields:</strong>" in page
@@ -61,6 +63,7 @@ def test_docstrings_are_rendered_as_markdown(site):
     assert "**Arguments:**" not in page
 
 
+@pytest.mark.slow
 def test_the_site_and_its_search_need_no_network(site):
     assert (site / "searchindex.js").stat().st_size > 10_000
     for page in site.rglob("*.html"):

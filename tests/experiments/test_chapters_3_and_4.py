@@ -278,6 +278,7 @@ def test_tiny_runs_of_chapter_3_have_rows_like_the_committed_ones(name, of_seque
     assert shown(name, results, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHOSEN)
 def test_tiny_runs_of_chapter_4_have_rows_like_the_committed_ones(name, of_teams, tmp_path):
     results = measured(name, [of_teams[cell] for cell in CHOSEN[name]])

@@ -179,6 +179,7 @@ def test_every_method_on_rovers_has_the_same_team_discount_rates_and_updates():
 # --------------------------------------------------------------------------- measured, and its page
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*ON_MUJOCO, *TEAMS])
 def test_its_numbers_are_plain_and_its_page_renders(name, trained, tmp_path, monkeypatch):
     monkeypatch.setattr(measures, "_rover_baselines", lambda env: {"random": 0.1, "bound": 1.0})

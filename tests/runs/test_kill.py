@@ -20,6 +20,7 @@ def test_killed_three_times(tmp_path):
     assert newest == "00000600"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("what", "generations"), [("merl", 800), ("matd3", 1200)])
 def test_teams_killed_once_while_they_train(tmp_path, what, generations):
     assert kill.compare(tmp_path, 1, generations, seed=10, what=what) == []
