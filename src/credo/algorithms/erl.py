@@ -158,7 +158,8 @@ class ERL(Hybrid):
         state, played = play(self, state, state.population, self.episodes, key=play_key)
         fitness = average = jnp.mean(played.of(self.reward), axis=1)
 
-        state = balance(self, state, fitness)
+        if self.share is not None:
+            state = balance(self, state, fitness)
 
         # 8-15: rank, keep the elites, select, cross and mutate.
         if self.remember:

@@ -216,8 +216,7 @@ def explore(hybrid: Hybrid, state: HybridState, frames: Frames, *, key: Key) -> 
 
 def balance(hybrid: Hybrid, state: HybridState, fitness: Fitness) -> HybridState:
     """With the share of frames that learners get in this generation."""
-    if hybrid.share is None or not hybrid.learners:
-        return state
+    assert hybrid.share is not None
     guests = state.lineage.guest >= 0
     return replace(state, share=hybrid.share.after(state.share, rankable(fitness), guests))
 
@@ -252,9 +251,7 @@ def _until_shared(hybrid: Hybrid, state: HybridState, metrics: Metrics, frames: 
     return state, metrics | {"learner_share": state.share, "learner_rounds": rounds}
 
 
-def improve(
-    hybrid: Hybrid, state: HybridState, frames: Frames, episodes: int, *, key: Key
-) -> Result:
+def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: Key) -> Result:
     """Each learner makes `updates_per_frame` updates for each of some new `frames`, on minibatches
     of its own from the common buffer. The state counts these frames, and their `episodes`."""
     ready = (state.frames >= hybrid.warmup_frames) & bool(hybrid.learners)

@@ -106,7 +106,8 @@ class MERL(Hybrid):
         state, played = play(self, state, state.population, self.episodes, key=rollout_key)
         fitness = jnp.mean(played.of(self.reward), axis=1)
 
-        state = balance(self, state, fitness)
+        if self.share is not None:
+            state = balance(self, state, fitness)
 
         # 10-14: rank, keep e elites, select k-e by tournament, cross with elites; and mutate.
         state, bred = breed(self, state, fitness, key=breed_key)

@@ -7,6 +7,7 @@ from typing import ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .. import require
@@ -102,11 +103,7 @@ class AbstractCriticNetwork(eqx.Module):
     """What `AbstractCritic.init` makes: weights, and how they value state and action."""
 
     action_size: eqx.AbstractVar[int]
-
-    @property
-    @abc.abstractmethod
-    def values(self) -> AbstractValues:
-        """What its outputs say of the return."""
+    values: eqx.AbstractVar[AbstractValues]  # what its outputs say of the return
 
     @abc.abstractmethod
     def atoms(
@@ -157,7 +154,8 @@ class Critic(AbstractCritic):
         sizes = (inputs, *self.hidden, self.values.atoms)
         weights |= draw_layers(sizes, self.initializer, self.normalization, key=layers_key)
         weights = scaled(weights, len(self.hidden), self.output_scale)
-        return CriticNetwork(weights=weights, config=self, action_size=action_size)
+        made = {"config": self, "values": self.values, "action_size": action_size}
+        return CriticNetwork(weights=weights, **made)
 
 
 class CriticNetwork(AbstractCriticNetwork):
@@ -165,11 +163,8 @@ class CriticNetwork(AbstractCriticNetwork):
 
     weights: dict[str, Float[Array, "..."]]
     config: Critic = eqx.field(static=True)
+    values: AbstractValues
     action_size: int = eqx.field(static=True)
-
-    @property
-    def values(self) -> AbstractValues:
-        return self.config.values
 
     def atoms(self, obs, action):
         c = self.config
@@ -199,19 +194,15 @@ class ResidualCritic(AbstractCritic):
     def init(self, obs_size, action_size, *, key):
         sizes = (obs_size + action_size, *(self.width,) * (1 + 2 * self.blocks), self.values.atoms)
         weights = draw_layers(sizes, "uniform", "before", key=key)
-        return ResidualCriticNetwork(weights=weights, config=self, action_size=action_size)
+        return ResidualCriticNetwork(weights=weights, values=self.values, action_size=action_size)
 
 
 class ResidualCriticNetwork(AbstractCriticNetwork):
     """Weights by name as in `MLPPolicy`; of block b the layers 2b + 1 and 2b + 2."""
 
     weights: dict[str, Float[Array, "..."]]
-    config: ResidualCritic = eqx.field(static=True)
+    values: AbstractValues
     action_size: int = eqx.field(static=True)
-
-    @property
-    def values(self) -> AbstractValues:
-        return self.config.values
 
     def atoms(self, obs, action):
         def layer(i, x):
@@ -236,10 +227,7 @@ def draw_layers(
     weights = draw(shapes, "normal" if initializer == "uniform" else initializer, key=key)
     if initializer == "uniform":
         # The distribution function of a Gaussian draw is uniform.
-        weights = {
-            name: bounds[name] * (2.0 * jax.scipy.stats.norm.cdf(w) - 1.0)
-            for name, w in weights.items()
-        }
+        weights = {k: bounds[k] * (2.0 * norm.cdf(w) - 1.0) for k, w in weights.items()}
     if normalization != "none":
         for layer, units in enumerate(sizes[1:-1]):
             weights |= {f"g_{layer}": jnp.ones(units), f"s_{layer}": jnp.zeros(units)}

@@ -195,18 +195,17 @@ class JointCritic(AbstractCritic):
         networks = eqx.filter_vmap(
             lambda key: self.critic.init(agents * obs_size, agents * action_size, key=key)
         )(jax.random.split(key, agents))
-        return JointCriticNetwork(networks, action_size)
+        return JointCriticNetwork(
+            networks=networks, values=self.critic.values, action_size=action_size
+        )
 
 
 class JointCriticNetwork(AbstractCriticNetwork):
     """One network per agent: leaves `[agents, ...]`. Here `*batch` is `n agents`."""
 
     networks: CriticNetwork
+    values: AbstractValues
     action_size: int = eqx.field(static=True)
-
-    @property
-    def values(self) -> AbstractValues:
-        return self.networks.values
 
     def atoms(self, obs, action):
         together = (_join(obs), _join(action))
