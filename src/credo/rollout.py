@@ -63,11 +63,8 @@ def evaluate(
     if isinstance(env, AbstractHostEnvironment):
         return _play_on_host(env, population, episodes, episodes, common, False, key=key)[0]
     packed = getattr(population, "features_first", False)
-    if isinstance(env, Given) and not (packed and episodes == env.n):
-        raise ValueError(
-            f"{env.n} given sequences are played once each by features-first policies: {episodes} "
-            f"episodes were asked for, of {type(population).__name__}"
-        )
+    if isinstance(env, Given):
+        env.require_once(population, episodes)
     if isinstance(env, AbstractSequenceTask) and packed:
         return _answer(env, population, episodes, common, key=key)
     lanes = _lanes(population, episodes, common, key=key)
@@ -107,7 +104,7 @@ def record(
     seed: int | None = None,
     see: See = lambda over: None,
 ) -> Trace:
-    """The episode that `evaluate(env, tree.stack(policy), 1, key=key)` plays, moment by moment.
+    """The episode that `evaluate(env, tree.single(policy), 1, key=key)` plays, moment by moment.
 
     **Arguments:**
 
@@ -128,7 +125,7 @@ def score(
     env: Environment, policy: AbstractPolicy, episodes: int, *, key: PRNGKeyArray
 ) -> Float[Array, ""]:
     """Mean return of one policy on fresh episodes, of the signal that the task reports."""
-    played = evaluate(env, tree.stack(policy), episodes, key=key)
+    played = evaluate(env, tree.single(policy), episodes, key=key)
     return jnp.mean(sound(env, played.of(env.reported)))
 
 
@@ -282,7 +279,7 @@ def _record(env: AbstractEnvironment, policy: AbstractPolicy, *, key: PRNGKeyArr
 def _record_on_host(
     env: AbstractHostEnvironment, policy: AbstractPolicy, seed: int | None, see: See, *, key
 ) -> Trace:
-    form, arrays = _apart(tree.stack(policy))
+    form, arrays = _apart(tree.single(policy))
     drawn, carry = _start_on_host(form, arrays, (1, 1), True, key)
     seeds = np.array([np.asarray(drawn).item() if seed is None else seed], np.uint32)
     told, carries = Episodes(env, 1, True), [carry]

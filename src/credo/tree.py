@@ -57,6 +57,12 @@ def stack(*members: PyTree) -> PyTree:
     return jax.tree.map(join, *members)
 
 
+def single(member: PyTree) -> PyTree:
+    """A population of one; Python floats become arrays, as in `stack`."""
+    held, rest = eqx.partition(member, lambda x: eqx.is_array(x) or eqx.is_inexact_array_like(x))
+    return eqx.combine(jax.tree.map(lambda x: jnp.asarray(x)[None], held), rest)
+
+
 def where(pred: Bool[Array, ""], a: PyTree, b: PyTree) -> PyTree:
     """`a` if `pred` else `b`, leaf by leaf."""
     return jax.tree.map(lambda x, y: jnp.where(pred, x, y) if eqx.is_array(x) else x, a, b)

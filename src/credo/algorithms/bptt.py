@@ -137,7 +137,7 @@ class BPTT(eqx.Module):
         """`updates` steps of Adam, and a test of the network on fresh sequences."""
         learn_key, test_key = jax.random.split(key)
         state, losses, frames = descend(self, state, key=learn_key)
-        test = evaluate(self.env, tree.stack(state.champion), self.test_episodes, key=test_key)
+        test = evaluate(self.env, tree.single(state.champion), self.test_episodes, key=test_key)
         metrics = {
             "loss": jnp.mean(losses),
             "champion_score": jnp.mean(test.of(self.env.reported)),

@@ -169,8 +169,7 @@ class ERL(Hybrid):
 
         # 16-29: learners play too, with noise, and their mean return is their value; then as many
         # updates as frames, each learner on minibatches of its own.
-        frames, keys = jnp.sum(played.steps), (explore_key, learn_key)
-        state, learned = teach(self, state, frames, keys=keys)
+        state, learned = teach(self, state, jnp.sum(played.steps), keys=(explore_key, learn_key))
 
         # 30-33: allocate the workers of the next generation.
         if self.manager is not None and self.learners:

@@ -204,7 +204,7 @@ def explore(hybrid: Hybrid, state: HybridState, frames: Frames, *, key: Key) -> 
     metrics, workers = {}, hybrid.workers
     for i, learner in enumerate(hybrid.learners):
         mine = jnp.sum((state.allocation == i).astype(jnp.int32))
-        team = tree.stack(learner.explorer(state.learners[i], jnp.bool_(False)))
+        team = tree.single(learner.explorer(state.learners[i], jnp.bool_(False)))
         how = {"wanted": mine, "common": False, "key": jax.random.fold_in(key, i)}
         state, played = play(hybrid, state, team, workers, **how)
         returns, theirs = played.of(hybrid.reward)[0], jnp.arange(workers) < mine
@@ -258,9 +258,9 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
     updates = jnp.where(ready, frames.astype(jnp.float32) * hybrid.updates_per_frame, 0.0)
     updates = updates.astype(jnp.int32)
     learned, metrics = [], {"updates": updates}
+    how = {"signal": hybrid.reward, "moments": state.seen, "sampling": hybrid.sampling}
     for i, learner in enumerate(hybrid.learners):
-        given = {"signal": hybrid.reward, "moments": state.seen, "sampling": hybrid.sampling}
-        given["key"] = jax.random.fold_in(key, i)
+        given = how | {"key": jax.random.fold_in(key, i)}
         after, report = learn(learner, state.learners[i], state.replay, updates, **given)
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}

@@ -115,8 +115,7 @@ class MERL(Hybrid):
         # 8: Rollout(π_pg, R, noise=W_g, ξ=1), in parallel worlds.
         # 15-21: for agent k: a minibatch from R^k; descend the critic's loss; follow the gradient
         # of Q with head k; move the targets.
-        frames, keys = jnp.sum(played.steps), (explore_key, learn_key)
-        state, learned = teach(self, state, frames, keys=keys)
+        state, learned = teach(self, state, jnp.sum(played.steps), keys=(explore_key, learn_key))
 
         # 22: Migrate: the weakest teams become copies of π_pg.
         due = (state.generation % self.migration_period == 0) & (learned["updates"] > 0)

@@ -143,7 +143,7 @@ class OffPolicy(eqx.Module):
         explore_key, learn_key, test_key = jax.random.split(key, 3)
 
         # Act with noise (at first at random), and remember every transition.
-        explorer = tree.stack(
+        explorer = tree.single(
             self.learner.explorer(state.learner, state.frames < self.start_frames)
         )
         how = {"common": False, "key": explore_key}

@@ -157,7 +157,7 @@ class PPO(eqx.Module):
         wanted = jnp.clip(jnp.ceil(self.horizon / state.length).astype(jnp.int32), 1, self.copies)
         std: Any = jnp.exp(state.actor.log_std)
         explorer = (state.actor.mean, GaussianNoise(std), jnp.bool_(False), self.env.action_size)
-        explorer = behind(state.moments, tree.stack(Explorer(*explorer, clipped=False)))
+        explorer = behind(state.moments, tree.single(Explorer(*explorer, clipped=False)))
         how = {"wanted": wanted, "common": False, "key": explore_key}
         played, experience = collect(self.env, explorer, self.copies, **how)
         empty = Replay(state.replay.data, jnp.int32(0))

@@ -41,7 +41,7 @@ class MazeTrace(eqx.Module):
 
 
 def trace_maze(env: ExtendedTMaze, policy: AbstractPolicy, *, key: PRNGKeyArray) -> MazeTrace:
-    """The episode that `evaluate(env, tree.stack(policy), 1, key=key)` plays, trial by trial."""
+    """The episode that `evaluate(env, tree.single(policy), 1, key=key)` plays, trial by trial."""
     played = record(env, policy, key=key)
     shown = env.shown(played)
     ends = np.flatnonzero(np.diff(played.states.trial)) + 1  # the moments at which a trial is over

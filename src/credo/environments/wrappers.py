@@ -81,6 +81,14 @@ class Given(AbstractCut):
     def max_steps(self) -> int:
         return self.sequences.inputs.shape[1]
 
+    def require_once(self, population: Any, episodes: int) -> None:
+        """Raise `ValueError` unless each sequence is played once, by features-first policies."""
+        if not (getattr(population, "features_first", False) and episodes == self.n):
+            raise ValueError(
+                f"{self.n} given sequences are played once each by features-first policies: "
+                f"{episodes} episodes were asked for, of {type(population).__name__}"
+            )
+
     def sample(self, *, key: PRNGKeyArray) -> Sequence:
         i = jax.random.randint(key, (), 0, self.n)
         return jax.tree.map(lambda x: x[i], self.sequences)

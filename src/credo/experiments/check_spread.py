@@ -61,7 +61,7 @@ def build(method: str) -> OffPolicy:
 @functools.cache
 def random(env: SimpleSpread) -> dict[str, float]:
     """Mean return of actions drawn uniformly."""
-    team = tree.stack(scripts.random_team(env))
+    team = tree.single(scripts.random_team(env))
     played = measures.returns(env, team, EPISODES, measures.BASELINE_KEY)
     return {"random": round(float(np.mean(played)), 2)}
 

@@ -171,7 +171,7 @@ def random_actions(env: Any, episodes: int = 100) -> dict[str, float]:
     """Mean return of actions drawn uniformly from [-1, 1], and its standard error."""
     actor = MLP(hidden=()).init(env.obs_size, env.action_size, key=jax.random.key(0))
     policy = Explorer(actor, GaussianNoise(), jnp.bool_(True), env.action_size)
-    played = returns(env, tree.stack(policy), episodes, BASELINE_KEY)[0].astype(np.float64)
+    played = returns(env, tree.single(policy), episodes, BASELINE_KEY)[0].astype(np.float64)
     mean, error = statistics.mean_and_standard_error(played)
     return {"random": round(float(mean), 2), "random, s.e.": round(float(error), 2)}
 

@@ -58,7 +58,7 @@ def played(run: Run, task: Any, episodes: int | None, seed: int) -> Result:
     if episodes is None:
         host = issubclass(type(task), AbstractHostEnvironment)
         episodes = HOST_EPISODES if host else EPISODES
-    evaluation = in_turn(task, tree.stack(run.champion), episodes, key=_key(seed))
+    evaluation = in_turn(task, tree.single(run.champion), episodes, key=_key(seed))
     returns = {name: np.asarray(evaluation.returns[name][0], np.float64) for name in task.signals}
     whole = ~np.any([np.isnan(x.reshape(episodes, -1)).any(1) for x in returns.values()], axis=0)
     scores = {name: _score(values[whole]) for name, values in returns.items()}
@@ -142,7 +142,7 @@ def _stream(
     """Lines about the champion on sequences of any length, whose memory does not grow with it."""
     streams = min(episodes or EPISODES, 20)
     lengths = counting.longest_correct(
-        tree.stack(run.champion),
+        tree.single(run.champion),
         task.depth,
         streams,
         min_gap=task.min_gap,
