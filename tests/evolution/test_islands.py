@@ -1,4 +1,4 @@
-"""Islands: who breeds with whom, and which one is settled anew."""
+"""Islands: which members breed with each other, and which island is re-initialised."""
 
 import equinox as eqx
 import jax
@@ -48,7 +48,7 @@ def test_islands_have_keys_of_their_own():
         (jnp.zeros(12), 1),  # of equals the first: the champion's island stays
     ],
 )
-def test_the_island_with_the_worst_best_is_settled_anew(fitness, weakest):
+def test_the_island_with_the_worst_best_is_reinitialised(fitness, weakest):
     bred = Islands(ISLANDS, renewal=1)(best_alone, lambda: FRESH, OLD, fitness, key=KEY)
     new = np.asarray(bred["b"]).reshape(ISLANDS, SIZE) == -1
     assert new.all(axis=1).tolist() == [i == weakest for i in range(ISLANDS)]

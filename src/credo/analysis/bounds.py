@@ -48,7 +48,8 @@ def exact(env: object) -> bool:
 def baselines(env: object) -> dict[str, float]:
     """Mean returns of random, constant and scripted policies, by name; none of them learns.
 
-    **Raises:** `TypeError` if none are known for such a task.
+    **Raises:** `TypeError` if none are known for such a task, `ValueError` if none are for these
+    settings of it.
     """
     return _of(env).baselines(env)
 

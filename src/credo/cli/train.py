@@ -215,10 +215,10 @@ def _without_injection(algorithm: Any, run: Any) -> str:
     for name in ("sync_period", "migration_period"):
         period, done = getattr(algorithm, name, 0), int(run.metrics["generation"][-1])
         if getattr(algorithm, "learners", ()) and done <= period:
+            often = "generation" if period == 1 else f"{period} generations"
             return (
-                f"{run.path} is evolution alone: its learners join the population every {period} "
-                f"generations, and it made {done}: give more --frames, or fewer "
-                f"--{name.replace('_', '-')}"
+                f"{run.path} is evolution alone: its learners join the population every {often}, "
+                f"and it made {done}: give more --frames, or fewer --{name.replace('_', '-')}"
             )
     return ""
 

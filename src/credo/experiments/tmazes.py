@@ -102,7 +102,8 @@ def cell(
 
 def full(env: ExtendedTMaze, network: str) -> tuple[int, int]:
     """Generations and runs at the full budget. A generation of three robots takes three times as
-    long as one of one; a feed-forward network has two policies to choose from, and is settled."""
+    long as one of one; a feed-forward network has two policies to choose from, and finds the better
+    one soon."""
     if env.robots > 1:
         return 1_000, 3
     if network == "ff":

@@ -4,6 +4,7 @@ It reads what runs have recorded: no environment is opened, and no code that a r
 imported but Credo's own. So a page about a stranger's run needs no trust in them.
 """
 
+import functools
 import json
 import pathlib
 import shlex
@@ -238,8 +239,12 @@ def _bounds(group: list[Run]) -> tuple[Reference, Reference] | None:
     """The best baseline and the upper bound of a run's task, where they are known exactly. No
     other task is made: that might run code of others."""
     task = group[0].part("env")
-    if not bounds.exact(task):
-        return None
+    return _limits(task) if bounds.exact(task) else None
+
+
+@functools.cache  # every figure and the table ask for them; a T-maze takes seconds
+def _limits(task: Any) -> tuple[Reference, Reference]:
+    """`_bounds` of a task of which they are known."""
     name, value = bounds.best_baseline(task)
     highest = bounds.upper_bound(task).value
     return Reference(f"baseline: {name}", value), Reference("upper bound", highest)

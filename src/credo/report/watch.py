@@ -43,7 +43,7 @@ def watch(
 
     **Arguments:**
 
-    - `output`: a file that ends in .html, .gif, or .mp4, which needs the extra `credo[video]`;
+    - `output`: a file that ends in .html, .gif, or .mp4, which needs imageio-ffmpeg;
       None: `champion.html` in the run's folder, or `champion.gif` where there is no page.
     - `episodes`: one after the other, with seeds `seed`, `seed` + 1, …
     - `fps`: environment steps shown per second; None: in real time, as far as the environment

@@ -69,7 +69,7 @@ class Log:
 
     def sync(self):
         """Put the rows on the disk: a checkpoint must never be ahead of them. Raises `OSError`, and
-        `DamagedLog` if the file was shortened or lengthened by somebody else."""
+        `DamagedLog` if the file was shortened or lengthened from outside."""
         if self.size:
             with _explained():
                 files.sync(self.metrics)

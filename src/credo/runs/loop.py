@@ -377,7 +377,7 @@ class _Training:
     """A run that goes on: where it is, what it writes and who hears of it.
 
     - `generation`, `frames`: how many are done; `safe`: the generation of the newest checkpoint.
-    - `state`, `best`: donated to every dispatch, so nobody else may hold them.
+    - `state`, `best`: donated to every dispatch, so nothing else may hold them.
     - `reached`: which limit of the budget was reached, in words; `ended`: why else it is to end.
     - `chunk`: generations that the next dispatch may hold, at most `CHUNK`.
     - `began`, `last_save`: seconds of the monotonic clock; `before`: seconds of training before.

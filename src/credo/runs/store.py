@@ -28,7 +28,7 @@ class Run:
     """A run on disk, finished or not. Reading it changes nothing.
 
     `path`: its folder. `config`: its record (see `record`), checked and whole. `trusted`: whether
-    code of somebody's own that it names may be imported.
+    code of others that it names may be imported.
     """
 
     def __init__(self, path: str | pathlib.Path, *, trust: bool = False, best: bool = False):
