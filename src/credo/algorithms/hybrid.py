@@ -264,15 +264,13 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
         after, report = learn(learner, state.learners[i], state.replay, updates, **given)
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}
-    state = replace(state, learners=tuple(learned), moments=state.seen)
     counted = {"frames": state.frames + frames, "episodes": state.episodes + episodes}
-    return replace(state, **counted), metrics
+    return replace(state, learners=tuple(learned), moments=state.seen, **counted), metrics
 
 
 def inject(hybrid: Hybrid, state: HybridState, due: Bool[Array, ""]) -> HybridState:
     """If `due`, the learners' actors take the last slots: the offspring of the weakest parents."""
-    pairs = zip(hybrid.learners, state.learners, strict=True)
-    actors = [learner.actor(own) for learner, own in pairs]
+    actors = [x.actor(own) for x, own in zip(hybrid.learners, state.learners, strict=True)]
     population, lineage = _injected(state.population, state.lineage, actors, due)
     return replace(state, population=population, lineage=lineage)
 
