@@ -17,11 +17,13 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
 from ..compilation import float32, jit, repeat
-from ..evolution.breeder import Breeder, draw
+from ..evolution.breeder import AbstractBreeder, draw
 from ..evolution.selection import rankable, ranking
 from ..learners.base import AbstractLearner, learn
+from ..learners.coach import AbstractCoach
 from ..learners.manager import UCB, AbstractManager, Ledger, even
 from ..learners.share import AbstractShare
+from ..learners.surrogate import AbstractSurrogate
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..normalization import Moments, behind, frozen, warmed, watched
 from ..replay import Replay, Sampling, extend
@@ -54,6 +56,7 @@ class HybridState(eqx.Module):
     frames: Int[Array, ""] = _field(0, jnp.int32)
     episodes: Int[Array, ""] = _field(0, jnp.int32)
     generation: Int[Array, ""] = _field(0, jnp.int32)
+    breeding: PyTree = None  # what the breeder remembers
 
 
 class Hybrid(eqx.Module):
@@ -63,11 +66,13 @@ class Hybrid(eqx.Module):
     network: eqx.AbstractVar[AbstractNetwork]
     learners: eqx.AbstractVar[tuple[AbstractLearner, ...]]
     population_size: eqx.AbstractVar[int]
-    breeder: eqx.AbstractVar[Breeder]
+    breeder: eqx.AbstractVar[AbstractBreeder]
     episodes: eqx.AbstractVar[int]
     workers: eqx.AbstractVar[int]
     manager: eqx.AbstractVar[AbstractManager | None]
     share: eqx.AbstractVar[AbstractShare | None]
+    coach: eqx.AbstractVar[AbstractCoach | None]
+    surrogate: eqx.AbstractVar[AbstractSurrogate | None]
     redistribute: eqx.AbstractVar[bool]
     sampling: eqx.AbstractVar[Sampling]
     updates_per_frame: eqx.AbstractVar[float]
@@ -88,6 +93,10 @@ class Hybrid(eqx.Module):
             objective(self.env, reward)
         q = len(self.learners)
         self.breeder.check(self.population_size, self.network, learners=q)
+        if self.coach is not None:
+            self.coach.check(self.population_size, self.elites, self.learners)
+        if self.surrogate is not None:
+            self.surrogate.check(self.breeder, self.learners)
         if self.manager is None and self.workers < q:
             raise ValueError(
                 f"{self.workers} workers for {q} learners: some would never play; give at least as "
@@ -125,28 +134,33 @@ class Hybrid(eqx.Module):
         population_key, *keys = jax.random.split(key, 1 + q)
         pairs = zip(self.learners, keys, strict=True)
         population = draw(network, env.sizes, k, key=population_key)
+        first_key = jax.random.fold_in(population_key, k)
+        population, breeding = self.breeder.first(population, key=first_key)
         moments = Moments.first(env, network) if self.normalize_observations else None
         return HybridState(
             population=population,
             lineage=Lineage.first(k, q),
             learners=tuple(one.init(network, *env.sizes, key=key) for one, key in pairs),
             replay=Replay.empty(blank(env), self.replay_capacity) if q else None,
-            ledger=Ledger.empty(q),
+            ledger=(self.manager or UNMANAGED).first(q),
             allocation=even(self.workers, max(q, 1)),
             champion=frozen(moments, tree.take(population, 0)),
             moments=moments,
             seen=moments,
             share=jnp.float32(self.share.first() if self.share else 0.0),
+            breeding=breeding,
         )
 
     def warm(self, state: HybridState, policy: AbstractPolicy) -> HybridState:
         """`state` that goes on from a saved policy: it becomes the first member and the actor of
         every learner, and all see observations by its statistics."""
         policy, moments = warmed(policy, state.moments)
+        population, breeding = self.breeder.warm(state.breeding, state.population, policy)
         pairs = zip(self.learners, state.learners, strict=True)
         return replace(
             state,
-            population=tree.put(state.population, 0, policy),
+            population=population,
+            breeding=breeding,
             learners=tuple(learner.warm(own, policy) for learner, own in pairs),
             champion=frozen(moments, policy),
             moments=moments,
@@ -179,20 +193,22 @@ def play(hybrid: Hybrid, state: HybridState, policies, episodes: int, **how) -> 
 
 def breed(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key) -> Result:
     """The next population with its lineage, and the champion of this one."""
-    given = (state.population, state.lineage, fitness)
-    population, lineage, champion, metrics = bred(hybrid, *given, key=key)
-    state = replace(state, population=population, lineage=lineage, generation=state.generation + 1)
+    given = (state.breeding, state.population, state.lineage, fitness)
+    population, lineage, breeding, champion, metrics = bred(hybrid, *given, key=key)
+    after = {"breeding": breeding, "generation": state.generation + 1}
+    state = replace(state, population=population, lineage=lineage, **after)
     return replace(state, champion=frozen(state.moments, champion)), metrics
 
 
 @jit
-def bred(hybrid: Hybrid, population: PyTree, lineage: Lineage, fitness: Fitness, *, key: Key):
+def bred(hybrid: Hybrid, memory, population: PyTree, lineage: Lineage, fitness, *, key: Key):
     """`breed` of what it needs, so that the replay buffer is not copied."""
     fresh = partial(draw, hybrid.network, hybrid.env.sizes)
-    offspring, descent = hybrid.breeder(population, fitness, fresh, key=key)
+    given = (memory, population, fitness, fresh)
+    offspring, descent, memory = hybrid.breeder.next(*given, key=key)
     best = ranking(fitness)[0]
     metrics = lineage.report(best, descent)
-    return offspring, lineage.after(descent), tree.take(population, best), metrics
+    return offspring, lineage.after(descent), memory, tree.take(population, best), metrics
 
 
 def explore(hybrid: Hybrid, state: HybridState, frames: Frames, *, key: Key) -> Result:

@@ -34,15 +34,18 @@ from jaxtyping import PRNGKeyArray
 
 from .. import require
 from ..compilation import float32
-from ..evolution.breeder import Breeder, evolving
+from ..evolution.breeder import AbstractBreeder, evolving
 from ..learners.base import AbstractLearner
+from ..learners.coach import AbstractCoach
 from ..learners.share import AbstractShare
+from ..learners.surrogate import AbstractSurrogate
 from ..learners.td3 import TD3, TEAM
 from ..networks.base import AbstractNetwork
 from ..networks.team import Team
 from ..replay import Sampling
 from ..rollout import Environment
 from ..types import Metrics
+from .aid import coached, preselect
 from .erl import BREEDER as ERL_BREEDER
 from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
 
@@ -60,12 +63,18 @@ class MERL(Hybrid):
     network: AbstractNetwork = Team()
     learners: tuple[AbstractLearner, ...] = (LOCAL,)  # of the whole team, each of its own reward
     population_size: int = eqx.field(static=True, default=20)  # k: teams, at least 2
-    breeder: Breeder = BREEDER  # how the next population is made
+    breeder: AbstractBreeder = BREEDER  # how the next population is made
     episodes: int = eqx.field(static=True, default=10)  # ξ: episodes per fitness value, ≥ 1
     workers: int = eqx.field(static=True, default=50)  # learners' episodes per generation, ≥ 1
     share: AbstractShare | None = None
     """What part of all frames the learners play, in rounds of `workers` episodes that are each
     learned from; None: one round per generation."""
+    coach: AbstractCoach | None = None
+    """Members that are moved by the gradient of the first learner's critic before they are
+    evaluated; None: none are."""
+    surrogate: AbstractSurrogate | None = None
+    """Breeds more offspring than are played, of which the critic of the first learner chooses;
+    None: all are played."""
     migration_period: int = eqx.field(static=True, default=1)  # generations between migrations, ≥ 1
     sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     updates_per_frame: float = 0.1  # updates of each learner, for all agents, per frame played, ≥ 0
@@ -110,7 +119,8 @@ class MERL(Hybrid):
             state = balance(self, state, fitness)
 
         # 10-14: rank, keep e elites, select k-e by tournament, cross with elites; and mutate.
-        state, bred = breed(self, state, fitness, key=breed_key)
+        breeding = breed if self.surrogate is None else preselect
+        state, bred = breeding(self, state, fitness, key=breed_key)
 
         # 8: Rollout(π_pg, R, noise=W_g, ξ=1), in parallel worlds.
         # 15-21: for agent k: a minibatch from R^k; descend the critic's loss; follow the gradient
@@ -120,5 +130,9 @@ class MERL(Hybrid):
         # 22: Migrate: the weakest teams become copies of π_pg.
         due = (state.generation % self.migration_period == 0) & (learned["updates"] > 0)
         state = inject(self, state, due)
+        if self.coach is not None:
+            coach_key = jax.random.fold_in(key, 6)
+            state, steps = coached(self, state, learned["updates"], key=coach_key)
+            learned |= steps
 
         return tested(self, state, fitness, bred | learned, key=test_key)
