@@ -17,6 +17,7 @@ from credo.evolution.breeder import Breeder
 from credo.evolution.cem import CEM
 from credo.learners.base import AbstractLearner
 from credo.learners.coach import Coached
+from credo.learners.horizon import Truncated
 from credo.learners.manager import UCB, AbstractManager, Progress, Thompson, Uniform
 from credo.learners.sac import SAC
 from credo.learners.surrogate import Preselection
@@ -91,12 +92,13 @@ def test_a_member_of_a_family_is_chosen_by_its_word(words, expected):
 
 def test_what_a_population_may_have_is_chosen_by_words():
     words = "--breeder cem --parents 0.4 --coach coached --coach.share 0.3 --surrogate preselection"
-    words += " --surrogate.states 64 --manager progress --manager.kind change"
+    words += " --surrogate.states 64 --manager progress --manager.kind change --horizon truncated"
     made = taken(ERL.erl(Copy()), *words.split())
     assert made.breeder == CEM(parents=0.4)
     assert made.coach == Coached(share=0.3)
     assert made.surrogate == Preselection(states=64)
     assert made.manager == Progress(kind="change")
+    assert made.horizon == Truncated()
     assert config.from_tree(config.to_tree(made), trust=False) == made
     assert taken(made, "--breeder", "genetic", "--coach", "none").breeder == Breeder()
 

@@ -75,7 +75,7 @@ def test_nothing_happens_before_the_learner_has_learned(played):
 def test_a_generation_coaches_and_counts_it(played):
     erl, state = played
     after, metrics = jax.jit(erl.generation)(state, key=jax.random.key(1))
-    steps = int(0.3 * metrics["updates"]) // 3
+    steps = int(0.3 * int(metrics["updates"])) // 3
     assert metrics["coach_updates"] == 3 * steps > 0
     assert np.sum(after.lineage.maker == COACHED) == 3
 

@@ -95,7 +95,7 @@ def test_offspring_promise_more_than_those_of_one_breeding(played):
 
     fitness, key = jnp.arange(4.0), jax.random.key(3)
     after, metrics = preselect(erl, state, fitness, key=key)
-    wait = replace(state, frames=jnp.int32(-1))  # as before the warm-up is over
+    wait = replace(state, learned=jnp.bool_(False))
     plain, _ = preselect(erl, wait, fitness, key=key)
     gain = promised(after.population) - promised(plain.population)
     assert gain[0] == 0.0

@@ -1,9 +1,10 @@
-"""What the critic of a hybrid's first learner does for its population: it coaches members, and says
-which offspring are worth playing."""
+"""What the critic of a hybrid's first learner does for its population: it coaches members, says
+which offspring are worth playing, and what the rest of an episode is worth that was cut short."""
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,8 +17,12 @@ from .. import tree
 from ..compilation import jit
 from ..evolution.breeder import AbstractBreeder
 from ..evolution.selection import rankable
+from ..learners.base import act, scaled
 from ..learners.surrogate import AbstractSurrogate
-from .hybrid import Fitness, Hybrid, HybridState, Key, Result, breed
+from ..normalization import behind, seen
+from ..rollout import collect
+from ..types import Batch, Transition
+from .hybrid import Fitness, Hybrid, HybridState, Key, Played, Result, breed, stored
 
 
 def coached(hybrid: Hybrid, state: HybridState, updates: Int[Array, ""], *, key: Key) -> Result:
@@ -45,7 +50,7 @@ def coached(hybrid: Hybrid, state: HybridState, updates: Int[Array, ""], *, key:
 
 
 def preselect(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key) -> Result:
-    """`breed`, with each offspring the most promising of several, once `warmup_frames` were played.
+    """`breed`, with each offspring the most promising of several, once the learner has learned.
 
     **Returns:** the state, and beside the metrics of `breed` the `surrogate_agreement`: the rank
     correlation, in [-1, 1], of a real fitness and of what the surrogate says of the same members.
@@ -53,11 +58,53 @@ def preselect(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key)
     assert hybrid.surrogate is not None
     key, judge_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
     about = (hybrid.learners[0], state.learners[0], state.replay, _of(hybrid, state), judge_key)
-    ready = state.frames >= hybrid.warmup_frames
-    breeder = Preselecting(hybrid.breeder, hybrid.surrogate, about, ready)
+    breeder = Preselecting(hybrid.breeder, hybrid.surrogate, about, state.learned)
     after, metrics = breed(replace(hybrid, breeder=breeder), state, fitness, key=key)
     values = _judged(hybrid.surrogate, about, state.population)
     return after, metrics | {"surrogate_agreement": agreement(values, rankable(fitness))}
+
+
+def play_ahead(
+    hybrid: Hybrid, state: HybridState, policies: PyTree, episodes: int, *, key: Key
+) -> Played:
+    """`play` for as many steps as the hybrid's `horizon` says, once the learner has learned. To the
+    returns of episodes that were cut short the value of their last state is added."""
+    assert hybrid.horizon is not None
+    most = jnp.int32(hybrid.env.max_steps)
+    limit = jnp.where(state.learned, jnp.minimum(hybrid.horizon.steps, most), most)
+    acting = behind(state.moments, policies)
+    played, new = collect(hybrid.env, acting, episodes, limit=limit, key=key)
+    about = (hybrid.learners[0], state.learners[0], state.replay, state.moments)
+    cut = (played.steps == limit) & (limit < most)
+    after = stored(hybrid, state, played, new)
+    if not len(new.transitions.terminated):  # every episode was lost
+        return after, played
+    rest = _rest(hybrid.reward, about, policies, new.last(played), cut)
+    returns = played.returns | {hybrid.reward: played.of(hybrid.reward) + rest}
+    return after, replace(played, returns=returns)
+
+
+@jit
+def _rest(
+    reward: str, about: PyTree, policies: PyTree, last: Transition, cut: Bool[Array, "pop episodes"]
+) -> Float[Array, "pop episodes"]:
+    """What the critic says of the states in which episodes were `cut`, in units of the reward; 0 of
+    those that terminated just then, and of all others."""
+    learner, state, replay, moments = about
+    learner = scaled(learner, replay, reward)
+    obs = seen(moments, jnp.asarray(last.next_obs)).reshape(*cut.shape, *last.next_obs.shape[1:])
+    arrays, static = eqx.partition(policies, eqx.is_array)
+
+    def one(given: tuple[PyTree, Array]) -> Array:
+        member, obs = eqx.combine(given[0], static), given[1]
+        none = jnp.zeros(obs.shape[:-1])
+        off = none.astype(bool)
+        batch = Batch(obs, act(member, obs), none, obs, off, off)
+        return learner.value(state, member, batch).reshape(len(obs), -1).mean(axis=1)
+
+    value = jax.lax.map(one, (arrays, obs)) / jnp.maximum(learner.reward_scale, 1e-8)
+    over = jnp.asarray(last.terminated).reshape(*cut.shape, -1).all(axis=-1)
+    return jnp.where(cut & ~over, value, 0.0)
 
 
 class Preselecting(AbstractBreeder):
@@ -110,7 +157,7 @@ def agreement(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, ""]:
     return jnp.sum(x * y) / jnp.maximum(jnp.sum(x * x), 1e-6)
 
 
-def _of(hybrid: Hybrid, state: HybridState) -> dict[str, object]:
+def _of(hybrid: Hybrid, state: HybridState) -> dict[str, Any]:
     """How the first learner draws minibatches."""
     how = {"signal": hybrid.learners[0].signal or hybrid.reward, "moments": state.moments}
     return how | {"sampling": hybrid.sampling}

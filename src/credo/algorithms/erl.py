@@ -38,6 +38,7 @@ from ..evolution.breeder import AbstractBreeder, Breeder, evolving, overridden
 from ..evolution.mutation import MatrixMutation
 from ..learners.base import AbstractLearner
 from ..learners.coach import AbstractCoach
+from ..learners.horizon import AbstractHorizon
 from ..learners.manager import UCB, AbstractManager
 from ..learners.share import AbstractShare
 from ..learners.surrogate import AbstractSurrogate
@@ -48,7 +49,7 @@ from ..networks.team import Team
 from ..replay import Sampling
 from ..rollout import Environment
 from ..types import Metrics
-from .aid import coached, preselect
+from .aid import coached, play_ahead, preselect
 from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
 
 TABLE_5_1 = {  # task: (ψ, ξ, ω)
@@ -97,6 +98,9 @@ class ERL(Hybrid):
     surrogate: AbstractSurrogate | None = None
     """Breeds more offspring than are played, of which the critic of the first learner chooses;
     None: all are played."""
+    horizon: AbstractHorizon | None = None
+    """Cuts the population's episodes short, with the value that the critic of the first learner
+    gives to the rest; None: episodes are played to the end."""
     sync_period: int = eqx.field(static=True, default=10)  # ω: generations between injections, ≥ 1
     sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     updates_per_frame: float = 1.0  # gradient updates of each learner per frame played, ≥ 0
@@ -164,7 +168,8 @@ class ERL(Hybrid):
         """One pass of the outer loop of Algorithms 6 and 10."""
         play_key, breed_key, explore_key, learn_key, manage_key, test_key = jax.random.split(key, 6)
         # 6-7: for actor in pop: fitness, R = Evaluate(actor, R, noise=None, ξ)
-        state, played = play(self, state, state.population, self.episodes, key=play_key)
+        playing = play if self.horizon is None else play_ahead
+        state, played = playing(self, state, state.population, self.episodes, key=play_key)
         fitness = average = jnp.mean(played.of(self.reward), axis=1)
 
         if self.share is not None:

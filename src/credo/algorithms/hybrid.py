@@ -21,13 +21,14 @@ from ..evolution.breeder import AbstractBreeder, draw
 from ..evolution.selection import rankable, ranking
 from ..learners.base import AbstractLearner, learn
 from ..learners.coach import AbstractCoach
+from ..learners.horizon import AbstractHorizon
 from ..learners.manager import UCB, AbstractManager, Ledger, even
 from ..learners.share import AbstractShare
 from ..learners.surrogate import AbstractSurrogate
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..normalization import Moments, behind, frozen, warmed, watched
 from ..replay import Replay, Sampling, extend
-from ..rollout import Environment, blank, collect
+from ..rollout import Environment, Experience, blank, collect
 from ..types import Evaluation, Metrics
 from .fitness import objective, retested
 from .lineage import Lineage
@@ -56,6 +57,7 @@ class HybridState(eqx.Module):
     frames: Int[Array, ""] = _field(0, jnp.int32)
     episodes: Int[Array, ""] = _field(0, jnp.int32)
     generation: Int[Array, ""] = _field(0, jnp.int32)
+    learned: Bool[Array, ""] = _field(False, jnp.bool_)  # whether the learners ever did
     breeding: PyTree = None  # what the breeder remembers
 
 
@@ -73,6 +75,7 @@ class Hybrid(eqx.Module):
     share: eqx.AbstractVar[AbstractShare | None]
     coach: eqx.AbstractVar[AbstractCoach | None]
     surrogate: eqx.AbstractVar[AbstractSurrogate | None]
+    horizon: eqx.AbstractVar[AbstractHorizon | None]
     redistribute: eqx.AbstractVar[bool]
     sampling: eqx.AbstractVar[Sampling]
     updates_per_frame: eqx.AbstractVar[float]
@@ -97,6 +100,8 @@ class Hybrid(eqx.Module):
             self.coach.check(self.population_size, self.elites, self.learners)
         if self.surrogate is not None:
             self.surrogate.check(self.breeder, self.learners)
+        if self.horizon is not None:
+            self.horizon.check(self.reward, self.redistribute, self.learners)
         if self.manager is None and self.workers < q:
             raise ValueError(
                 f"{self.workers} workers for {q} learners: some would never play; give at least as "
@@ -184,11 +189,16 @@ def play(hybrid: Hybrid, state: HybridState, policies, episodes: int, **how) -> 
     """
     policies = behind(state.moments, policies)
     played, experience = collect(hybrid.env, policies, episodes, **how)
-    state = replace(state, seen=watched(state.seen, experience))
-    if state.replay is not None:
-        new = experience.spread(played) if hybrid.redistribute else experience
-        state = replace(state, replay=extend(state.replay, new.transitions, new.valid))
-    return state, played
+    return stored(hybrid, state, played, experience), played
+
+
+def stored(hybrid: Hybrid, state: HybridState, played: Evaluation, new: Experience) -> HybridState:
+    """With what was met, in the replay buffer and in the moments."""
+    state = replace(state, seen=watched(state.seen, new))
+    if state.replay is None:
+        return state
+    new = new.spread(played) if hybrid.redistribute else new
+    return replace(state, replay=extend(state.replay, new.transitions, new.valid))
 
 
 def breed(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key) -> Result:
@@ -282,7 +292,7 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
         metrics |= {f"{name}_{i}": value for name, value in report.items()}
     state = replace(state, learners=tuple(learned), moments=state.seen)
     counted = {"frames": state.frames + frames, "episodes": state.episodes + episodes}
-    return replace(state, **counted), metrics
+    return replace(state, learned=state.learned | (updates > 0), **counted), metrics
 
 
 def inject(hybrid: Hybrid, state: HybridState, due: Bool[Array, ""]) -> HybridState:

@@ -37,6 +37,7 @@ from ..compilation import float32
 from ..evolution.breeder import AbstractBreeder, evolving
 from ..learners.base import AbstractLearner
 from ..learners.coach import AbstractCoach
+from ..learners.horizon import AbstractHorizon
 from ..learners.share import AbstractShare
 from ..learners.surrogate import AbstractSurrogate
 from ..learners.td3 import TD3, TEAM
@@ -45,7 +46,7 @@ from ..networks.team import Team
 from ..replay import Sampling
 from ..rollout import Environment
 from ..types import Metrics
-from .aid import coached, preselect
+from .aid import coached, play_ahead, preselect
 from .erl import BREEDER as ERL_BREEDER
 from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
 
@@ -75,6 +76,9 @@ class MERL(Hybrid):
     surrogate: AbstractSurrogate | None = None
     """Breeds more offspring than are played, of which the critic of the first learner chooses;
     None: all are played."""
+    horizon: AbstractHorizon | None = None
+    """Cuts the population's episodes short, with the value that the critic of the first learner
+    gives to the rest; None: episodes are played to the end."""
     migration_period: int = eqx.field(static=True, default=1)  # generations between migrations, ≥ 1
     sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     updates_per_frame: float = 0.1  # updates of each learner, for all agents, per frame played, ≥ 0
@@ -112,7 +116,8 @@ class MERL(Hybrid):
         """One pass of the outer loop of Algorithm 13."""
         rollout_key, breed_key, explore_key, learn_key, test_key = jax.random.split(key, 5)
         # 6-9: for team π: g, R = Rollout(π, R, noise=None, ξ); g is π's fitness.
-        state, played = play(self, state, state.population, self.episodes, key=rollout_key)
+        playing = play if self.horizon is None else play_ahead
+        state, played = playing(self, state, state.population, self.episodes, key=rollout_key)
         fitness = jnp.mean(played.of(self.reward), axis=1)
 
         if self.share is not None:

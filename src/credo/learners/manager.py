@@ -163,6 +163,7 @@ class Progress(AbstractManager):
         require.literals(self)
         require.within("exploration", self.exploration, 0, 1)
         floats = isinstance(self.slow, int | float) and isinstance(self.memory, int | float)
+        floats = floats and self.memory > 0.0  # else it is said what is wrong with the memory
         if floats and not 0.0 < self.slow < self.memory:
             raise ValueError(
                 f"slow is {self.slow}: it must lie above 0 and below memory, {self.memory}"

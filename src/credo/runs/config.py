@@ -35,6 +35,7 @@ from ..evolution.mutation import AbstractMutation
 from ..evolution.selection import AbstractSelection
 from ..learners.base import AbstractLearner
 from ..learners.coach import AbstractCoach
+from ..learners.horizon import AbstractHorizon
 from ..learners.manager import AbstractManager
 from ..learners.share import AbstractShare
 from ..learners.surrogate import AbstractSurrogate
@@ -60,6 +61,7 @@ EXTENSIONS = (
     AbstractBreeder,
     AbstractCoach,
     AbstractSurrogate,
+    AbstractHorizon,
 )
 PACKAGES = ("credo", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
 
