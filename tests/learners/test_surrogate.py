@@ -54,7 +54,7 @@ def test_each_slot_gets_the_best_of_its_candidates_with_its_descent(ready):
     old = jnp.zeros((4, 1))
     chosen, descent, _ = breeder.next(None, old, jnp.zeros(4), None, key=key)
     each = [Lots().next(None, old, None, None, key=one)[0] for one in jax.random.split(key, 3)]
-    expected = np.max(each, axis=0) if ready else np.asarray(each[0])
+    expected = np.max(each, axis=0) if ready else np.array(each[0])
     expected[0] = -9.0  # the elite is nobody's choice
     np.testing.assert_array_equal(chosen, expected)
     assert descent.parent.tolist() == (expected[:, 0] * np.float32(1e6)).astype(int).tolist()
@@ -81,8 +81,8 @@ def test_values_are_the_critics_mean_over_states(played):
     for i in range(4):
         member = tree.take(state.population, i)
         actions = jax.vmap(lambda x, member=member: member(x, None)[0])(obs)
-        expected = jnp.mean(state.learners[0].critics[0](obs.T, actions.T))
-        assert values[i] == pytest.approx(expected, abs=0.02)
+        expected = float(jnp.mean(state.learners[0].critics[0](obs.T, actions.T)))
+        assert float(values[i]) == pytest.approx(expected, abs=0.02)
 
 
 def test_offspring_promise_more_than_those_of_one_breeding(played):
