@@ -47,7 +47,7 @@ def value(erl, state, member):
 
 def test_some_offspring_climb_the_critic_and_nobody_else_moves(played):
     erl, state = played
-    after, metrics = coached(erl, state, jnp.int32(500), key=jax.random.key(2))
+    after, metrics = coached(erl, state, {"updates": jnp.int32(500)}, key=jax.random.key(2))
     assert metrics["coach_updates"] == 3 * 50  # 500·0.3 steps of three members together
     moved = np.any(rows(after.population) != rows(state.population), axis=1)
     assert moved.sum() == 3
@@ -64,10 +64,12 @@ def test_some_offspring_climb_the_critic_and_nobody_else_moves(played):
 def test_nothing_happens_before_the_learner_has_learned(played):
     erl, state = played
     for updates in (jnp.int32(0), jnp.int32(5)):  # 5·0.3 is less than one step each
-        after, metrics = coached(erl, state, updates, key=jax.random.key(2))
+        after, metrics = coached(erl, state, {"updates": updates}, key=jax.random.key(2))
         assert metrics["coach_updates"] == 0
         np.testing.assert_array_equal(rows(after.population), rows(state.population))
-    after, _ = jax.jit(lambda s, n: coached(erl, s, n, key=jax.random.key(2)))(state, 0)
+    after, _ = jax.jit(lambda s, n: coached(erl, s, {"updates": n}, key=jax.random.key(2)))(
+        state, jnp.int32(0)
+    )
     np.testing.assert_array_equal(rows(after.population), rows(state.population))
     assert not np.any(after.lineage.maker == COACHED)
 

@@ -65,10 +65,15 @@ def played():
     return erl, state
 
 
+def kept(state):
+    """With a buffer that can be given away."""
+    return replace(state, replay=jax.tree.map(jnp.copy, state.replay))
+
+
 def test_the_value_of_the_last_state_is_added_in_units_of_the_reward(played):
     erl, state = played
     given = (state.population, 2)
-    _, ahead = play_ahead(erl, state, *given, key=jax.random.key(5))
+    _, ahead = play_ahead(erl, kept(state), *given, key=jax.random.key(5))
     before, new = collect(erl.env, *given, limit=jnp.int32(3), key=jax.random.key(5))
     last = np.asarray(new.last(before).next_obs).reshape(4, 2, 1)
     for i in range(4):
@@ -87,7 +92,7 @@ def test_the_population_plays_less_and_learners_play_on(played):
     assert after.frames == state.frames + metrics["frames"]
     assert after.replay.written == after.frames
     long = replace(erl, horizon=Truncated(10))  # as long as an episode: nothing is added
-    _, whole = play_ahead(long, state, state.population, 1, key=jax.random.key(5))
+    _, whole = play_ahead(long, kept(state), state.population, 1, key=jax.random.key(5))
     plain, _ = collect(erl.env, state.population, 1, key=jax.random.key(5))
     np.testing.assert_allclose(whole.returns["reward"], plain.returns["reward"], rtol=1e-6)
 

@@ -130,7 +130,7 @@ def test_thompson_tries_a_learner_of_which_nothing_is_known():
 def test_progress_is_the_lead_of_the_fast_mean_over_the_slow_one():
     """By hand: two returns 0, 10 of the first learner, 10, 8 of the second, 5 of the third."""
     manager = Progress(slow=0.1, memory=0.5)
-    ledger = manager.first(3)
+    ledger = Ledger.empty(3)
     for i, returns in enumerate(([0.0, 10.0], [10.0, 8.0], [5.0])):
         ledger = observe(manager, ledger, i, returns)
     np.testing.assert_allclose(ledger.value, [5.0, 9.0, 5.0], rtol=1e-6)
@@ -146,8 +146,8 @@ def test_progress_is_the_lead_of_the_fast_mean_over_the_slow_one():
 
 def test_progress_is_even_at_first_and_ignores_what_is_no_number():
     manager = Progress()
-    np.testing.assert_allclose(manager.chances(manager.first(4)), [0.25] * 4)
-    ledger = observe(manager, manager.first(2), 0, [3.0, np.nan, 7.0])
+    np.testing.assert_allclose(manager.chances(Ledger.empty(4)), [0.25] * 4)
+    ledger = observe(manager, Ledger.empty(2), 0, [3.0, np.nan, 7.0])
     np.testing.assert_allclose(ledger.before, [3.2, 0.0], rtol=1e-6)
     # Of the second learner nothing is known: it counts as the one with the most progress.
     np.testing.assert_allclose(manager.chances(ledger), [0.5, 0.5])

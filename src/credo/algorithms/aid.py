@@ -21,21 +21,21 @@ from ..learners.base import act, scaled
 from ..learners.surrogate import AbstractSurrogate
 from ..normalization import behind, seen
 from ..rollout import collect
-from ..types import Batch, Transition
+from ..types import Batch, Metrics, Transition
 from .hybrid import Fitness, Hybrid, HybridState, Key, Played, Result, breed, stored
 
 
-def coached(hybrid: Hybrid, state: HybridState, updates: Int[Array, ""], *, key: Key) -> Result:
+def coached(hybrid: Hybrid, state: HybridState, metrics: Metrics, *, key: Key) -> Result:
     """Some of the next population, neither elites nor learners' actors and drawn anew each time,
-    moved by the gradient of the first learner's critic, after so many updates of it.
+    moved by the gradient of the first learner's critic, by the number of its `updates`.
 
-    **Returns:** the state, and as metric `coach_updates`, the gradient steps of all members. They
-    are not among the `updates`, which are the learners'.
+    **Returns:** the state, and with the metrics `coach_updates`, the gradient steps of all members.
+    They are not among the `updates`, which are the learners'.
     """
     assert hybrid.coach is not None
     size, choose_key = hybrid.population_size, jax.random.fold_in(key, 0)
-    n, steps = hybrid.coach.count(size), hybrid.coach.steps(updates, size)
-    told = {"coach_updates": n * steps}
+    n, steps = hybrid.coach.count(size), hybrid.coach.steps(metrics["updates"], size)
+    told = metrics | {"coach_updates": n * steps}
     if not isinstance(steps, jax.core.Tracer) and steps == 0:
         return state, told  # nothing need be compiled for it yet
     free = offspring(hybrid.breeder, size) & (state.lineage.guest < 0)
@@ -91,7 +91,7 @@ def _rest(
     """What the critic says of the states in which episodes were `cut`, in units of the reward; 0 of
     those that terminated just then, and of all others."""
     learner, state, replay, moments = about
-    learner = scaled(learner, replay, reward)
+    learner = learner if learner.reward_scale is not None else scaled(learner, replay, reward)
     obs = seen(moments, jnp.asarray(last.next_obs)).reshape(*cut.shape, *last.next_obs.shape[1:])
     arrays, static = eqx.partition(policies, eqx.is_array)
 

@@ -147,7 +147,7 @@ class Hybrid(eqx.Module):
             lineage=Lineage.first(k, q),
             learners=tuple(one.init(network, *env.sizes, key=key) for one, key in pairs),
             replay=Replay.empty(blank(env), self.replay_capacity) if q else None,
-            ledger=(self.manager or UNMANAGED).first(q),
+            ledger=Ledger.empty(q),
             allocation=even(self.workers, max(q, 1)),
             champion=frozen(moments, tree.take(population, 0)),
             moments=moments,

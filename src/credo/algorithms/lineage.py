@@ -82,7 +82,8 @@ class Lineage(eqx.Module):
     def fates(self, descent: Descent) -> dict[str, Int[Array, " q"]]:
         """How many of each learner's guests became elite, were selected as a parent, or neither
         (Table 5.2)."""
-        heirs = descent.heirs(self.guest.shape[0])
+        heirs = jnp.arange(self.guest.shape[0])[:, None] == descent.parent[None]
+        heirs = heirs if descent.parts is None else descent.parts.T > 0.0
         elite = jnp.any(heirs & descent.elite[None], axis=1)
         selected = jnp.any(heirs, axis=1) & ~elite
         mine = self.guest[:, None] == jnp.arange(self.share.shape[1] - 1)[None]

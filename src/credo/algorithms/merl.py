@@ -136,8 +136,6 @@ class MERL(Hybrid):
         due = (state.generation % self.migration_period == 0) & (learned["updates"] > 0)
         state = inject(self, state, due)
         if self.coach is not None:
-            coach_key = jax.random.fold_in(key, 6)
-            state, steps = coached(self, state, learned["updates"], key=coach_key)
-            learned |= steps
+            state, learned = coached(self, state, learned, key=jax.random.fold_in(key, 6))
 
         return tested(self, state, fitness, bred | learned, key=test_key)

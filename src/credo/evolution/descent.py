@@ -26,13 +26,6 @@ class Descent(eqx.Module):
     """Of members drawn from a distribution: the weight in its mean of each old member, of which
     `parent` is the heaviest. None: they come from parents and mates."""
 
-    def heirs(self, old: int) -> Bool[Array, "old pop"]:
-        """Whose weights each new member goes back to: its parent's, or those of all that have a
-        part in it."""
-        if self.parts is not None:
-            return self.parts.T > 0.0
-        return jnp.arange(old)[:, None] == self.parent[None]
-
     @classmethod
     def unchanged(cls, parent: Int[Array, " pop"], elite: bool, crossings: int) -> "Descent":
         """Of copies that are not changed, or, with parent -1, of members that are newly drawn."""

@@ -87,7 +87,7 @@ def learn(learner: AbstractLearner, state, replay: Replay, updates, **rest) -> L
 @jit
 def _learn(learner, state, replay: Replay, updates, *, signal, moments=None, sampling=UNIFORM, key):
     signal = learner.signal or signal
-    learner = scaled(learner, replay, signal)
+    learner = learner if learner.reward_scale is not None else scaled(learner, replay, signal)
     dynamic, static = eqx.partition(state, eqx.is_array)
 
     def body(i, loop):
@@ -113,10 +113,7 @@ def minibatch(learner, replay: Replay, *, signal, moments, sampling, key: PRNGKe
 
 
 def scaled(learner: Any, replay: Replay, signal: str) -> Any:
-    """With a number as `reward_scale`: where that is None, the scale at which the usual reward,
-    paid at every step, makes a return of 1."""
-    if learner.reward_scale is not None:
-        return learner
+    """With the scale at which the usual reward, paid at every step, makes a return of 1."""
     usual = jnp.maximum(replay.spread(signal), 1e-8)
     return replace(learner, reward_scale=jnp.maximum(1.0 - learner.gamma, 1e-4) / usual)
 

@@ -24,11 +24,13 @@ class Ledger(eqx.Module):
     square: Float[Array, " q"]  # running mean of their squares
     count: Int[Array, " q"]  # returns so far, y; their sum is H
     known: Bool[Array, " q"]  # whether any of them was a number
-    before: Float[Array, " q"] | None = None  # a slower mean, of managers that ask for it
+    before: Float[Array, " q"] | None = None  # a slower running mean; 0 unless a manager keeps it
 
     @classmethod
     def empty(cls, q: int) -> "Ledger":
-        return cls(jnp.zeros(q), jnp.zeros(q), jnp.zeros(q, jnp.int32), jnp.zeros(q, bool))
+        return cls(
+            jnp.zeros(q), jnp.zeros(q), jnp.zeros(q, jnp.int32), jnp.zeros(q, bool), jnp.zeros(q)
+        )
 
     @property
     def comparable(self) -> Float[Array, " q"]:
@@ -67,19 +69,11 @@ class AbstractManager(eqx.Module):
                 jnp.where(good, ledger.square.at[i].set(square), ledger.square),
                 ledger.count.at[i].add(1),
                 ledger.known.at[i].set(ledger.known[i] | good),
-                self.slower(ledger, i, value, good),
+                ledger.before,
             )
             return jax.tree.map(lambda a, b: jnp.where(counts, a, b), after, ledger), None
 
         return jax.lax.scan(one, ledger, (returns, played))[0]
-
-    def slower(self, ledger: Ledger, i: int, value: Array, good: Array) -> Array | None:
-        """The slower mean with a new value of learner `i`, if it is a `good` one."""
-        return ledger.before
-
-    def first(self, q: int) -> Ledger:
-        """The ledger before anybody played."""
-        return Ledger.empty(q)
 
     @abc.abstractmethod
     def allocate(self, ledger: Ledger, workers: int, *, key: PRNGKeyArray) -> Int[Array, " b"]:
@@ -169,14 +163,21 @@ class Progress(AbstractManager):
                 f"slow is {self.slow}: it must lie above 0 and below memory, {self.memory}"
             )
 
-    def first(self, q):
-        return replace(Ledger.empty(q), before=jnp.zeros(q))
+    @jit
+    def observe(self, ledger, i, returns, played):
+        """And the slow mean, likewise."""
 
-    def slower(self, ledger, i, value, good):
+        def one(loop, new):
+            slow, known = loop
+            counts = new[1] & jnp.isfinite(new[0])
+            weight = jnp.where(known, self.slow, 1.0)
+            mean = weight * new[0] + (1.0 - weight) * slow
+            return (jnp.where(counts, mean, slow), known | counts), None
+
         assert ledger.before is not None
-        weight = jnp.where(ledger.known[i], self.slow, 1.0)
-        mean = weight * value + (1.0 - weight) * ledger.before[i]
-        return jnp.where(good, ledger.before.at[i].set(mean), ledger.before)
+        (slow, _), _ = jax.lax.scan(one, (ledger.before[i], ledger.known[i]), (returns, played))
+        after = AbstractManager.observe(self, ledger, i, returns, played)
+        return replace(after, before=ledger.before.at[i].set(slow))
 
     def allocate(self, ledger, workers, *, key):
         return jax.random.choice(key, ledger.value.shape[0], (workers,), p=self.chances(ledger))
