@@ -82,6 +82,7 @@ def test_a_generation_coaches_and_counts_it(played):
     assert np.sum(after.lineage.maker == COACHED) == 3
 
 
+@pytest.mark.slow
 def test_teams_are_coached_too():
     learner = TD3(critic=Critic(hidden=(4,)), batch_size=8, signal="global")
     merl = MERL.merl(

@@ -1,5 +1,6 @@
 """What a hybrid's slots know is in its checkpoints."""
 
+import pytest
 import safetensors.numpy
 
 from credo.algorithms.erl import ERL
@@ -39,6 +40,7 @@ def results(path):
     return named | {"metrics": (path / "metrics.csv").read_bytes()}
 
 
+@pytest.mark.slow
 def test_stopped_and_resumed_is_bit_for_bit_the_straight_run(tmp_path):
     straight, stopped = tmp_path / "straight", tmp_path / "stopped"
     run = loop.train(EVERYTHING, generations=4, path=straight, **QUIET)
