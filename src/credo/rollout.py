@@ -50,6 +50,19 @@ class Experience(eqx.Module):
             rewards[name] = rows.reshape(self.transitions.rewards[name].shape)
         return eqx.tree_at(lambda e: e.transitions.rewards, self, rewards)
 
+    def last(self, played: Evaluation) -> Transition:
+        """The last transition of every episode, `[pop·episodes, ...]`; that of another one where
+        the episode was lost or not played."""
+        steps = played.steps.reshape(-1)
+        if self.valid is not None:
+            most = self.transitions.terminated.shape[0] // steps.size
+            at = jnp.arange(steps.size) * most + steps - 1
+            return jax.tree.map(lambda x: x[at], self.transitions)
+        # The episodes, one behind the other, without the lost ones.
+        returns = np.asarray(next(iter(played.returns.values()))).reshape(steps.size, -1)
+        at = np.cumsum(np.where(np.isfinite(returns[:, 0]), steps, 0)) - 1
+        return jax.tree.map(lambda x: x[at], self.transitions)
+
 
 @float32()
 def evaluate(
@@ -80,18 +93,20 @@ def collect(
     *,
     wanted: Int[Array, ""] | int | None = None,
     common: bool = True,
+    limit: Int[Array, ""] | None = None,
     key: PRNGKeyArray,
 ) -> tuple[Evaluation, Experience]:
     """`evaluate`, and every transition that was met. Outside JAX a finished episode costs no more
     physics; in JAX all lanes step until the last one ends.
 
     **Arguments:** of its `episodes` each member plays the first `wanted`; that number is data.
-    The others have no steps and a return of 0.
+    The others have no steps and a return of 0. Episodes are truncated after `limit` steps, which is
+    data too; None: when the task ends them.
     """
     wanted = episodes if wanted is None else wanted
     if isinstance(env, AbstractHostEnvironment):
-        return _play_on_host(env, population, episodes, wanted, common, True, key=key)
-    return _play(env, _lanes(population, episodes, common, key=key), jnp.int32(wanted), True)
+        return _play_on_host(env, population, episodes, wanted, common, True, limit, key=key)
+    return _play(env, _lanes(population, episodes, common, key=key), jnp.int32(wanted), True, limit)
 
 
 @float32()
@@ -181,7 +196,7 @@ def _play_in_turn(env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""
 
 @jit
 def _play(
-    env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: bool
+    env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: bool, limit: Any = None
 ) -> tuple[Evaluation, Any]:
     """All lanes `[pop, episodes]` take each step together, so that a row of the buffer is written
     in place; a `vmap` of whole episodes would copy the buffer at every step. `lanes`: policies
@@ -215,6 +230,9 @@ def _play(
         keys = _each(lambda key: jax.random.fold_in(key, t))(step_keys)
         bounded = jnp.clip(actions, -1.0, 1.0)
         states, step = _each(lambda s, a, key: env.step(s, a, key=key))(states, bounded, keys)
+        if limit is not None:
+            over = step.truncated | ((t + 1 >= limit) & ~step.terminated)
+            step = dataclasses.replace(step, truncated=over)
         for x in jax.tree.leaves((step.obs, step.rewards)):
             sound = sound & _sound(x)
         lost = lost | (active & ~sound)
@@ -308,6 +326,7 @@ def _play_on_host(
     wanted: Int[Array, ""] | int,
     common: bool,
     record: bool,
+    limit: Any = None,
     *,
     key: PRNGKeyArray,
 ) -> tuple[Evaluation, Any]:
@@ -316,7 +335,7 @@ def _play_on_host(
     pop = tree.size(population)
     form, arrays = _apart(population)
     seeds, first = _start_on_host(form, arrays, (pop, episodes), common, key)
-    told = Episodes(env, pop * episodes, record)
+    told = Episodes(env, pop * episodes, record, limit)
     for turn in env.turns(np.tile(np.arange(episodes) < int(wanted), pop)):
         obs, carry = told.begin(np.asarray(seeds).reshape(-1), turn), first
         while told.ongoing:

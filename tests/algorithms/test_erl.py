@@ -266,8 +266,8 @@ QUIET = evolved(
 def bred(algorithm, start, seed, fitness=FITNESS, lineage=None):
     """Bred population, its lineage, and the member whose copy each is (-1: changed)."""
     lineage = lineage or Lineage.first(K, 1)
-    population, lineage, champion, metrics = breed(
-        algorithm, start.population, lineage, fitness, key=jax.random.key(seed)
+    population, lineage, _, champion, metrics = breed(
+        algorithm, None, start.population, lineage, fitness, key=jax.random.key(seed)
     )
     members = [tree.take(start.population, j) for j in range(K)]
     copies = [

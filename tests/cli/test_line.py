@@ -6,18 +6,25 @@ from typing import Any
 import equinox as eqx
 import pytest
 
+from credo.algorithms.erl import ERL
 from credo.algorithms.off_policy import OffPolicy
 from credo.cli import names, values
 from credo.cli.line import Line
 from credo.environments import wrappers
 from credo.environments.probes import Copy
 from credo.environments.sequence_recall import SequenceRecall
+from credo.evolution.breeder import Breeder
+from credo.evolution.cem import CEM
 from credo.learners.base import AbstractLearner
-from credo.learners.manager import UCB, AbstractManager, Thompson, Uniform
+from credo.learners.coach import Coached
+from credo.learners.horizon import Truncated
+from credo.learners.manager import UCB, AbstractManager, Progress, Thompson, Uniform
 from credo.learners.sac import SAC
+from credo.learners.surrogate import Preselection
 from credo.learners.td3 import TD3, ddpg
 from credo.networks.exploration import GaussianNoise
 from credo.networks.mlp import ResidualCritic
+from credo.runs import config
 
 
 class Portfolio(eqx.Module):
@@ -81,6 +88,19 @@ def test_a_short_name_stands_for_all_fields_and_a_full_one_comes_before_it():
 )
 def test_a_member_of_a_family_is_chosen_by_its_word(words, expected):
     assert taken(Portfolio(Copy()), *words.split()).manager == expected
+
+
+def test_what_a_population_may_have_is_chosen_by_words():
+    words = "--breeder cem --parents 0.4 --coach coached --coach.share 0.3 --surrogate preselection"
+    words += " --surrogate.states 64 --manager progress --manager.kind change --horizon truncated"
+    made = taken(ERL.erl(Copy()), *words.split())
+    assert made.breeder == CEM(parents=0.4)
+    assert made.coach == Coached(share=0.3)
+    assert made.surrogate == Preselection(states=64)
+    assert made.manager == Progress(kind="change")
+    assert made.horizon == Truncated()
+    assert config.from_tree(config.to_tree(made), trust=False) == made
+    assert taken(made, "--breeder", "genetic", "--coach", "none").breeder == Breeder()
 
 
 def test_what_is_chosen_already_stays_as_it_is():

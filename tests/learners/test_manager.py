@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from credo.learners.manager import UCB, Ledger, Thompson, Uniform, even
+from credo.learners.manager import UCB, Ledger, Progress, Thompson, Uniform, even
 
 
 def ledger_of(value, count, square=None):
@@ -105,7 +105,7 @@ def test_impossible_settings_are_refused():
         UCB(exploration=-1.0)
     with pytest.raises(ValueError, match="memory is 2"):
         UCB(memory=2.0)
-    for manager in (UCB, Uniform, Thompson):
+    for manager in (UCB, Uniform, Thompson, Progress):
         with pytest.raises(ValueError, match=r"memory is 0.0: it must lie in \(0, 1\]"):
             manager(memory=0.0)
 
@@ -125,3 +125,33 @@ def test_a_return_that_is_no_number_costs_a_turn_and_nothing_else(manager):
 def test_thompson_tries_a_learner_of_which_nothing_is_known():
     ledger = observe(Thompson(), Ledger.empty(2), 0, [1000.0, 1001.0])
     assert Thompson().allocate(ledger, 5, key=jax.random.key(0)).tolist() == [1] * 5
+
+
+def test_progress_is_the_lead_of_the_fast_mean_over_the_slow_one():
+    """By hand: two returns 0, 10 of the first learner, 10, 8 of the second, 5 of the third."""
+    manager = Progress(slow=0.1, memory=0.5)
+    ledger = Ledger.empty(3)
+    for i, returns in enumerate(([0.0, 10.0], [10.0, 8.0], [5.0])):
+        ledger = observe(manager, ledger, i, returns)
+    np.testing.assert_allclose(ledger.value, [5.0, 9.0, 5.0], rtol=1e-6)
+    np.testing.assert_allclose(ledger.before, [1.0, 9.8, 5.0], rtol=1e-6)
+    # A fifth of all chances is even; the rest is in proportion to rises 4, 0, 0.
+    np.testing.assert_allclose(manager.chances(ledger), [0.2 / 3 + 0.8] + [0.2 / 3] * 2, atol=1e-6)
+    changes = Progress(kind="change", slow=0.1, memory=0.5).chances(ledger)
+    expected = 0.2 / 3 + 0.8 * np.array([4.0, 0.8, 0.0]) / 4.8
+    np.testing.assert_allclose(changes, expected, atol=1e-6)
+    workers = manager.allocate(ledger, 4000, key=jax.random.key(0))
+    assert np.mean(np.asarray(workers) == 0) == pytest.approx(0.867, abs=0.02)
+
+
+def test_progress_is_even_at_first_and_ignores_what_is_no_number():
+    manager = Progress()
+    np.testing.assert_allclose(manager.chances(Ledger.empty(4)), [0.25] * 4)
+    ledger = observe(manager, Ledger.empty(2), 0, [3.0, np.nan, 7.0])
+    np.testing.assert_allclose(ledger.before, [3.2, 0.0], rtol=1e-6)
+    # Of the second learner nothing is known: it counts as the one with the most progress.
+    np.testing.assert_allclose(manager.chances(ledger), [0.5, 0.5])
+    with pytest.raises(ValueError, match=r"slow is 0.3: it must lie above 0 and below memory"):
+        Progress(slow=0.3)
+    with pytest.raises(ValueError, match="kind is 'fall'"):
+        Progress(kind="fall")

@@ -236,3 +236,18 @@ def test_a_reward_scale_is_that_of_the_rewards(start):
 def test_impossible_settings_are_refused(field):
     with pytest.raises(ValueError, match=f"{field} is -1"):
         SAC(**{field: -1})
+
+
+def test_the_value_of_another_policy_is_the_lesser_of_the_critics():
+    @jax.jit
+    def values():
+        state = LEARNER.init(NETWORK, OBS, ACT, key=jax.random.key(0))
+        policy = NETWORK.init(OBS, ACT, key=jax.random.key(1))
+        obs, none = jnp.ones((N, OBS)), jnp.zeros(N)
+        batch = Batch(obs, jnp.zeros((N, ACT)), none, obs, none > 0.0, none > 0.0)
+        action = policy(obs[0], None)[0]
+        each = jnp.stack([critic(obs[0], action) for critic in state.critics])
+        return LEARNER.value(state, policy, batch), each
+
+    value, each = values()
+    np.testing.assert_allclose(value, np.full(N, each.min()), rtol=1e-5)

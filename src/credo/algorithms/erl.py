@@ -34,11 +34,14 @@ from jaxtyping import PRNGKeyArray
 
 from .. import require
 from ..compilation import float32
-from ..evolution.breeder import Breeder, evolving, overridden
+from ..evolution.breeder import AbstractBreeder, Breeder, evolving, overridden
 from ..evolution.mutation import MatrixMutation
 from ..learners.base import AbstractLearner
+from ..learners.coach import AbstractCoach
+from ..learners.horizon import AbstractHorizon
 from ..learners.manager import UCB, AbstractManager
 from ..learners.share import AbstractShare
+from ..learners.surrogate import AbstractSurrogate
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, ddpg
 from ..networks.base import AbstractNetwork
 from ..networks.mlp import MLP, Critic
@@ -46,6 +49,7 @@ from ..networks.team import Team
 from ..replay import Sampling
 from ..rollout import Environment
 from ..types import Metrics
+from .aid import coached, play_ahead, preselect
 from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
 
 TABLE_5_1 = {  # task: (ψ, ξ, ω)
@@ -76,7 +80,7 @@ class ERL(Hybrid):
     learners: tuple[AbstractLearner, ...] = (ddpg(),)
     """The portfolio: each learns from the experience of all. Empty: evolution alone."""
     population_size: int = eqx.field(static=True, default=10)  # k: members, at least 2
-    breeder: Breeder = BREEDER  # how the next population is made
+    breeder: AbstractBreeder = BREEDER  # how the next population is made
     episodes: int = eqx.field(static=True, default=1)  # ξ: episodes per fitness value, ≥ 1
     remember: bool = eqx.field(static=True, default=False)
     """Rank a member by the average fitness over all generations that it lived through, not by the
@@ -88,6 +92,15 @@ class ERL(Hybrid):
     share: AbstractShare | None = None
     """What part of all frames the learners play, in rounds of `workers` episodes that are each
     learned from; None: one round per generation."""
+    coach: AbstractCoach | None = None
+    """Members that are moved by the gradient of the first learner's critic before they are
+    evaluated; None: none are."""
+    surrogate: AbstractSurrogate | None = None
+    """Breeds more offspring than are played, of which the critic of the first learner chooses;
+    None: all are played."""
+    horizon: AbstractHorizon | None = None
+    """Cuts the population's episodes short, with the value that the critic of the first learner
+    gives to the rest; None: episodes are played to the end."""
     sync_period: int = eqx.field(static=True, default=10)  # ω: generations between injections, ≥ 1
     sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     updates_per_frame: float = 1.0  # gradient updates of each learner per frame played, ≥ 0
@@ -155,7 +168,8 @@ class ERL(Hybrid):
         """One pass of the outer loop of Algorithms 6 and 10."""
         play_key, breed_key, explore_key, learn_key, manage_key, test_key = jax.random.split(key, 6)
         # 6-7: for actor in pop: fitness, R = Evaluate(actor, R, noise=None, ξ)
-        state, played = play(self, state, state.population, self.episodes, key=play_key)
+        playing = play if self.horizon is None else play_ahead
+        state, played = playing(self, state, state.population, self.episodes, key=play_key)
         fitness = average = jnp.mean(played.of(self.reward), axis=1)
 
         if self.share is not None:
@@ -165,7 +179,8 @@ class ERL(Hybrid):
         if self.remember:
             lineage, average = state.lineage.averaged(fitness)
             state = replace(state, lineage=lineage)
-        state, bred = breed(self, state, average, key=breed_key)
+        breeding = breed if self.surrogate is None else preselect
+        state, bred = breeding(self, state, average, key=breed_key)
 
         # 16-29: learners play too, with noise, and their mean return is their value; then as many
         # updates as frames, each learner on minibatches of its own.
@@ -179,5 +194,7 @@ class ERL(Hybrid):
         # 34-36: every ω generations, copy each learner's actor over the weakest.
         due = (state.generation % self.sync_period == 0) & (learned["updates"] > 0)
         state = inject(self, state, due)
+        if self.coach is not None:
+            state, learned = coached(self, state, learned, key=jax.random.fold_in(key, 6))
 
         return tested(self, state, fitness, bred | learned, key=test_key)

@@ -17,15 +17,18 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
 from ..compilation import float32, jit, repeat
-from ..evolution.breeder import Breeder, draw
+from ..evolution.breeder import AbstractBreeder, draw
 from ..evolution.selection import rankable, ranking
 from ..learners.base import AbstractLearner, learn
+from ..learners.coach import AbstractCoach
+from ..learners.horizon import AbstractHorizon
 from ..learners.manager import UCB, AbstractManager, Ledger, even
 from ..learners.share import AbstractShare
+from ..learners.surrogate import AbstractSurrogate
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..normalization import Moments, behind, frozen, warmed, watched
 from ..replay import Replay, Sampling, extend
-from ..rollout import Environment, blank, collect
+from ..rollout import Environment, Experience, blank, collect
 from ..types import Evaluation, Metrics
 from .fitness import objective, retested
 from .lineage import Lineage
@@ -54,6 +57,8 @@ class HybridState(eqx.Module):
     frames: Int[Array, ""] = _field(0, jnp.int32)
     episodes: Int[Array, ""] = _field(0, jnp.int32)
     generation: Int[Array, ""] = _field(0, jnp.int32)
+    learned: Bool[Array, ""] = _field(False, jnp.bool_)  # whether the learners ever did
+    breeding: PyTree = None  # what the breeder remembers
 
 
 class Hybrid(eqx.Module):
@@ -63,11 +68,14 @@ class Hybrid(eqx.Module):
     network: eqx.AbstractVar[AbstractNetwork]
     learners: eqx.AbstractVar[tuple[AbstractLearner, ...]]
     population_size: eqx.AbstractVar[int]
-    breeder: eqx.AbstractVar[Breeder]
+    breeder: eqx.AbstractVar[AbstractBreeder]
     episodes: eqx.AbstractVar[int]
     workers: eqx.AbstractVar[int]
     manager: eqx.AbstractVar[AbstractManager | None]
     share: eqx.AbstractVar[AbstractShare | None]
+    coach: eqx.AbstractVar[AbstractCoach | None]
+    surrogate: eqx.AbstractVar[AbstractSurrogate | None]
+    horizon: eqx.AbstractVar[AbstractHorizon | None]
     redistribute: eqx.AbstractVar[bool]
     sampling: eqx.AbstractVar[Sampling]
     updates_per_frame: eqx.AbstractVar[float]
@@ -88,6 +96,12 @@ class Hybrid(eqx.Module):
             objective(self.env, reward)
         q = len(self.learners)
         self.breeder.check(self.population_size, self.network, learners=q)
+        if self.coach is not None:
+            self.coach.check(self.population_size, self.elites, self.learners)
+        if self.surrogate is not None:
+            self.surrogate.check(self.breeder, self.learners)
+        if self.horizon is not None:
+            self.horizon.check(self.reward, self.redistribute, self.learners)
         if self.manager is None and self.workers < q:
             raise ValueError(
                 f"{self.workers} workers for {q} learners: some would never play; give at least as "
@@ -125,6 +139,8 @@ class Hybrid(eqx.Module):
         population_key, *keys = jax.random.split(key, 1 + q)
         pairs = zip(self.learners, keys, strict=True)
         population = draw(network, env.sizes, k, key=population_key)
+        first_key = jax.random.fold_in(population_key, k)
+        population, breeding = self.breeder.first(population, key=first_key)
         moments = Moments.first(env, network) if self.normalize_observations else None
         return HybridState(
             population=population,
@@ -137,16 +153,19 @@ class Hybrid(eqx.Module):
             moments=moments,
             seen=moments,
             share=jnp.float32(self.share.first() if self.share else 0.0),
+            breeding=breeding,
         )
 
     def warm(self, state: HybridState, policy: AbstractPolicy) -> HybridState:
         """`state` that goes on from a saved policy: it becomes the first member and the actor of
         every learner, and all see observations by its statistics."""
         policy, moments = warmed(policy, state.moments)
+        population, breeding = self.breeder.warm(state.breeding, state.population, policy)
         pairs = zip(self.learners, state.learners, strict=True)
         return replace(
             state,
-            population=tree.put(state.population, 0, policy),
+            population=population,
+            breeding=breeding,
             learners=tuple(learner.warm(own, policy) for learner, own in pairs),
             champion=frozen(moments, policy),
             moments=moments,
@@ -170,29 +189,36 @@ def play(hybrid: Hybrid, state: HybridState, policies, episodes: int, **how) -> 
     """
     policies = behind(state.moments, policies)
     played, experience = collect(hybrid.env, policies, episodes, **how)
-    state = replace(state, seen=watched(state.seen, experience))
-    if state.replay is not None:
-        new = experience.spread(played) if hybrid.redistribute else experience
-        state = replace(state, replay=extend(state.replay, new.transitions, new.valid))
-    return state, played
+    return stored(hybrid, state, played, experience), played
+
+
+def stored(hybrid: Hybrid, state: HybridState, played: Evaluation, new: Experience) -> HybridState:
+    """With what was met, in the replay buffer and in the moments."""
+    state = replace(state, seen=watched(state.seen, new))
+    if state.replay is None:
+        return state
+    new = new.spread(played) if hybrid.redistribute else new
+    return replace(state, replay=extend(state.replay, new.transitions, new.valid))
 
 
 def breed(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key) -> Result:
     """The next population with its lineage, and the champion of this one."""
-    given = (state.population, state.lineage, fitness)
-    population, lineage, champion, metrics = bred(hybrid, *given, key=key)
-    state = replace(state, population=population, lineage=lineage, generation=state.generation + 1)
+    given = (state.breeding, state.population, state.lineage, fitness)
+    population, lineage, breeding, champion, metrics = bred(hybrid, *given, key=key)
+    after = {"breeding": breeding, "generation": state.generation + 1}
+    state = replace(state, population=population, lineage=lineage, **after)
     return replace(state, champion=frozen(state.moments, champion)), metrics
 
 
 @jit
-def bred(hybrid: Hybrid, population: PyTree, lineage: Lineage, fitness: Fitness, *, key: Key):
+def bred(hybrid: Hybrid, memory, population: PyTree, lineage: Lineage, fitness, *, key: Key):
     """`breed` of what it needs, so that the replay buffer is not copied."""
     fresh = partial(draw, hybrid.network, hybrid.env.sizes)
-    offspring, descent = hybrid.breeder(population, fitness, fresh, key=key)
+    given = (memory, population, fitness, fresh)
+    offspring, descent, memory = hybrid.breeder.next(*given, key=key)
     best = ranking(fitness)[0]
     metrics = lineage.report(best, descent)
-    return offspring, lineage.after(descent), tree.take(population, best), metrics
+    return offspring, lineage.after(descent), memory, tree.take(population, best), metrics
 
 
 def explore(hybrid: Hybrid, state: HybridState, frames: Frames, *, key: Key) -> Result:
@@ -265,7 +291,8 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}
     counted = {"frames": state.frames + frames, "episodes": state.episodes + episodes}
-    return replace(state, learners=tuple(learned), moments=state.seen, **counted), metrics
+    counted |= {"learned": state.learned | (updates > 0), "moments": state.seen}
+    return replace(state, learners=tuple(learned), **counted), metrics
 
 
 def inject(hybrid: Hybrid, state: HybridState, due: Bool[Array, ""]) -> HybridState:

@@ -1,19 +1,22 @@
 """Lineage: which operator made each member of a population, how much of it goes back to a learner,
 and what became of the learners' actors."""
 
+from dataclasses import replace
 from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .. import tree
 from ..evolution.descent import Descent
 from ..types import Metrics
 
 DRAWN, MUTATED, CROSSED, CROSSED_AND_MUTATED, INJECTED = range(5)  # of two the sum is both
+SAMPLED, COACHED = 5, 6
 MAKERS = ("drawn", "mutation", "crossover", "crossover and mutation", "learner")
+MAKERS = (*MAKERS, "distribution", "gradient steps")
 
 
 class Lineage(eqx.Module):
@@ -44,13 +47,13 @@ class Lineage(eqx.Module):
     def after(self, descent: Descent) -> "Lineage":
         """Of the next population."""
         parent, elite, before = descent.parent, descent.elite, self.share
-        share = before[parent]
+        share = before[parent] if descent.parts is None else descent.parts @ before
         for mate, taken in zip(descent.mate.T, descent.taken.T[..., None], strict=True):
             share = (1.0 - taken) * share + taken * before[mate]
             before = share  # later mates are members of the new population
         mutated, crossed = (x.astype(jnp.int32) for x in (descent.mutated, descent.crossed))
         made = MUTATED * mutated + CROSSED * crossed
-        made = jnp.where(made > 0, made, self.maker[parent])
+        made = jnp.where(made > 0, made, self.maker[parent] if descent.parts is None else SAMPLED)
         lived = (jnp.where(elite, x[parent], 0.0) for x in (self.earned, self.times))
         bred = Lineage(made, share, jnp.full_like(self.guest, -1), *lived)
         drawn = Lineage.first(len(parent), share.shape[1] - 1)
@@ -61,6 +64,12 @@ class Lineage(eqx.Module):
         own = jnp.eye(self.share.shape[1])[1 + learner]
         parts = (jnp.int32(INJECTED), own, jnp.int32(learner), jnp.zeros(()), jnp.zeros(()))
         return tree.put(self, slot, Lineage(*parts))
+
+    def coached(self, members: Int[Array, " n"], done: Bool[Array, ""]) -> "Lineage":
+        """If it is `done`, with members that were moved by a critic's gradient. Their weights stay
+        those of their parents, as after a mutation."""
+        made = jnp.where(done, COACHED, self.maker[members])
+        return replace(self, maker=self.maker.at[members].set(made))
 
     def report(self, champion: Int[Array, ""], descent: Descent) -> Metrics:
         """What made the champion, how much of it is each learner's, and each learner's fates."""
@@ -74,6 +83,7 @@ class Lineage(eqx.Module):
         """How many of each learner's guests became elite, were selected as a parent, or neither
         (Table 5.2)."""
         heirs = jnp.arange(self.guest.shape[0])[:, None] == descent.parent[None]
+        heirs = heirs if descent.parts is None else descent.parts.T > 0.0
         elite = jnp.any(heirs & descent.elite[None], axis=1)
         selected = jnp.any(heirs, axis=1) & ~elite
         mine = self.guest[:, None] == jnp.arange(self.share.shape[1] - 1)[None]

@@ -34,15 +34,19 @@ from jaxtyping import PRNGKeyArray
 
 from .. import require
 from ..compilation import float32
-from ..evolution.breeder import Breeder, evolving
+from ..evolution.breeder import AbstractBreeder, evolving
 from ..learners.base import AbstractLearner
+from ..learners.coach import AbstractCoach
+from ..learners.horizon import AbstractHorizon
 from ..learners.share import AbstractShare
+from ..learners.surrogate import AbstractSurrogate
 from ..learners.td3 import TD3, TEAM
 from ..networks.base import AbstractNetwork
 from ..networks.team import Team
 from ..replay import Sampling
 from ..rollout import Environment
 from ..types import Metrics
+from .aid import coached, play_ahead, preselect
 from .erl import BREEDER as ERL_BREEDER
 from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
 
@@ -60,12 +64,21 @@ class MERL(Hybrid):
     network: AbstractNetwork = Team()
     learners: tuple[AbstractLearner, ...] = (LOCAL,)  # of the whole team, each of its own reward
     population_size: int = eqx.field(static=True, default=20)  # k: teams, at least 2
-    breeder: Breeder = BREEDER  # how the next population is made
+    breeder: AbstractBreeder = BREEDER  # how the next population is made
     episodes: int = eqx.field(static=True, default=10)  # ξ: episodes per fitness value, ≥ 1
     workers: int = eqx.field(static=True, default=50)  # learners' episodes per generation, ≥ 1
     share: AbstractShare | None = None
     """What part of all frames the learners play, in rounds of `workers` episodes that are each
     learned from; None: one round per generation."""
+    coach: AbstractCoach | None = None
+    """Members that are moved by the gradient of the first learner's critic before they are
+    evaluated; None: none are."""
+    surrogate: AbstractSurrogate | None = None
+    """Breeds more offspring than are played, of which the critic of the first learner chooses;
+    None: all are played."""
+    horizon: AbstractHorizon | None = None
+    """Cuts the population's episodes short, with the value that the critic of the first learner
+    gives to the rest; None: episodes are played to the end."""
     migration_period: int = eqx.field(static=True, default=1)  # generations between migrations, ≥ 1
     sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     updates_per_frame: float = 0.1  # updates of each learner, for all agents, per frame played, ≥ 0
@@ -103,14 +116,16 @@ class MERL(Hybrid):
         """One pass of the outer loop of Algorithm 13."""
         rollout_key, breed_key, explore_key, learn_key, test_key = jax.random.split(key, 5)
         # 6-9: for team π: g, R = Rollout(π, R, noise=None, ξ); g is π's fitness.
-        state, played = play(self, state, state.population, self.episodes, key=rollout_key)
+        playing = play if self.horizon is None else play_ahead
+        state, played = playing(self, state, state.population, self.episodes, key=rollout_key)
         fitness = jnp.mean(played.of(self.reward), axis=1)
 
         if self.share is not None:
             state = balance(self, state, fitness)
 
         # 10-14: rank, keep e elites, select k-e by tournament, cross with elites; and mutate.
-        state, bred = breed(self, state, fitness, key=breed_key)
+        breeding = breed if self.surrogate is None else preselect
+        state, bred = breeding(self, state, fitness, key=breed_key)
 
         # 8: Rollout(π_pg, R, noise=W_g, ξ=1), in parallel worlds.
         # 15-21: for agent k: a minibatch from R^k; descend the critic's loss; follow the gradient
@@ -120,5 +135,7 @@ class MERL(Hybrid):
         # 22: Migrate: the weakest teams become copies of π_pg.
         due = (state.generation % self.migration_period == 0) & (learned["updates"] > 0)
         state = inject(self, state, due)
+        if self.coach is not None:
+            state, learned = coached(self, state, learned, key=jax.random.fold_in(key, 6))
 
         return tested(self, state, fitness, bred | learned, key=test_key)

@@ -28,7 +28,7 @@ from ..environments.base import AbstractSequenceTask
 from ..environments.curriculum import Curriculum
 from ..environments.sequence_classification import SequenceClassification
 from ..evolution.agents import AgentCrossover, apart
-from ..evolution.breeder import Breeder, draw, evolving, overridden
+from ..evolution.breeder import AbstractBreeder, Breeder, draw, evolving, overridden
 from ..evolution.crossover import NoCrossover, OnePointCrossover
 from ..evolution.extinction import Extinction
 from ..evolution.mutation import MatrixMutation
@@ -64,6 +64,7 @@ class NeuroevolutionState(eqx.Module):
     age: Int[Array, " pop"]  # how many generations that mean counts for; 0: bred just now
     level: Int[Array, ""]  # of the curriculum
     moments: Moments | None  # of all observations; None: they are not normalised
+    breeding: PyTree = None  # what the breeder remembers
 
 
 class Neuroevolution(eqx.Module):
@@ -72,7 +73,7 @@ class Neuroevolution(eqx.Module):
     env: Environment
     network: AbstractNetwork
     population_size: int = eqx.field(static=True, default=100)  # k: members, at least 2
-    breeder: Breeder = Breeder()  # how the next population is made
+    breeder: AbstractBreeder = Breeder()  # how the next population is made
     episodes: int = eqx.field(static=True, default=10)  # episodes per fitness value, ≥ 1
     test_episodes: int = eqx.field(static=True, default=50)  # episodes of a champion's test, ≥ 1
     elite_memory: int = eqx.field(static=True, default=1)
@@ -163,11 +164,12 @@ class Neuroevolution(eqx.Module):
         """1: Initialize a population of k neural networks."""
         k = self.population_size
         population = draw(self.network, self.env.sizes, k, key=key)
+        population, breeding = self.breeder.first(population, key=jax.random.fold_in(key, k))
         level = jnp.int32(self.curriculum.start if self.curriculum else 0)
         moments = Moments.first(self.env, self.network) if self.normalize_observations else None
         champion = frozen(moments, tree.take(population, 0))
         record, age = jnp.zeros(k), jnp.zeros(k, jnp.int32)
-        return NeuroevolutionState(population, champion, record, age, level, moments)
+        return NeuroevolutionState(population, champion, record, age, level, moments, breeding)
 
     @float32()
     def generation(
@@ -184,7 +186,7 @@ class Neuroevolution(eqx.Module):
 
         # 6-12: rank; keep the elites; select, and mutate the selected.
         order = ranking(fitness)
-        bred, record, age = breed(self, state, fitness, key=breed_key)
+        bred, record, age, breeding = breed(self, state, fitness, key=breed_key)
 
         # The network with the highest fitness is tested on fresh episodes of the whole task.
         champion = behind(state.moments, tree.take(population, order[:1]))
@@ -202,7 +204,8 @@ class Neuroevolution(eqx.Module):
             metrics["level"] = level
             level = self.curriculum.next(level, jnp.mean(evaluation.of(score)[order[0]]))
         champion = tree.take(champion, 0)
-        return NeuroevolutionState(bred, champion, record, age, level, moments), metrics
+        after = NeuroevolutionState(bred, champion, record, age, level, moments, breeding)
+        return after, metrics
 
 
 @jit
@@ -225,10 +228,12 @@ def assess(
 @jit
 def breed(
     algorithm: Neuroevolution, state: NeuroevolutionState, fitness: Fitness, *, key: PRNGKeyArray
-) -> tuple[PyTree, Fitness, Int[Array, " pop"]]:
-    """The next population; record and age of its elites, and none of its offspring."""
+) -> tuple[PyTree, Fitness, Int[Array, " pop"], PyTree]:
+    """The next population; record and age of its elites, and none of its offspring; and what the
+    breeder remembers."""
     fresh = partial(draw, algorithm.network, algorithm.env.sizes)
-    population, descent = algorithm.breeder(state.population, fitness, fresh, key=key)
+    given = (state.breeding, state.population, fitness, fresh)
+    population, descent, breeding = algorithm.breeder.next(*given, key=key)
     age = jnp.minimum(state.age[descent.parent] + 1, algorithm.elite_memory - 1)
     record = jnp.where(descent.elite, fitness[descent.parent], 0.0)
-    return population, record, jnp.where(descent.elite, age, 0)
+    return population, record, jnp.where(descent.elite, age, 0), breeding

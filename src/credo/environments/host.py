@@ -185,14 +185,15 @@ class AbstractHostEnvironment(AbstractTask):
 class Episodes:
     """One episode of each of `n` copies, as it is played: its length, its returns by reward and,
     if they are recorded, its transitions. Played in turn, each turn is `begin` and then `advance`
-    while it is `ongoing`.
+    while it is `ongoing`. Those that last longer than a `limit` are cut short.
 
     An episode is lost, with a return of NaN and no transitions, if it failed or if its policy said
     NaN or inf.
     """
 
-    def __init__(self, env: AbstractHostEnvironment, n: int, record: bool):
-        self.ongoing = False
+    def __init__(self, env: AbstractHostEnvironment, n: int, record: bool, limit: Any = None):
+        self.ongoing, most = False, env.max_steps
+        self._most = most if limit is None else min(int(limit), most)
         self.steps = np.zeros(n, np.int32)
         self._env, self._copies, self._record = env, env.copies(n), record
         self._lost = np.zeros(n, bool)
@@ -206,7 +207,7 @@ class Episodes:
             self._acting = np.ones((turn.size, self._env.agents), bool)
         self._obs = self._copies.reset(seeds, turn)
         self._active = self._less(turn, self._copies.failed)
-        self._rows, self._valid, self._left = [], [], self._env.max_steps
+        self._rows, self._valid, self._left = [], [], self._most
         self.ongoing = True
         return self._obs
 
@@ -220,12 +221,15 @@ class Episodes:
             lanes = active.reshape(-1, *[1] * (reward.ndim - 1))
             self._sums[name] += np.where(lanes, reward, 0.0)
         self.steps += active
+        over = now.truncated
+        if self._left == 1 and self._most < self._env.max_steps:
+            over = over | ~now.terminated
         if self._record:
-            ends = (now.ended, now.truncated, self._acting)
+            ends = (now.ended, over, self._acting)
             self._rows.append((self._obs, actions, now.rewards, now.obs, *ends))
             self._valid.append(active)
         active = self._less(active, now.failed)
-        self._active = active & ~(now.terminated | now.truncated)
+        self._active = active & ~(now.terminated | over)
         self._obs, self._acting, self._left = now.obs, now.active, self._left - 1
         self.ongoing = bool(self._left and self._active.any())
         if self._record and not self.ongoing:

@@ -1,8 +1,10 @@
 """Breeding: which members stay, which have offspring, and how offspring are changed.
 
-Neuroevolution, CCEA, ERL, CERL and MERL each hold one `Breeder` and differ in its fields.
+Neuroevolution, CCEA, ERL, CERL and MERL each hold one breeder: mostly a `Breeder`, a genetic
+algorithm, of which they differ in the fields. `evolution/cem.py` has another one.
 """
 
+import abc
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
@@ -33,7 +35,39 @@ Each = Callable[..., Rows]  # (operator, *parents, key=key) -> children, all of 
 Bred = tuple[PyTree, Descent]
 
 
-class Breeder(eqx.Module):
+class AbstractBreeder(eqx.Module):
+    """Makes each population from the one before it and its fitness. What it has to know beside
+    these, its memory, is part of a run's state: any pytree of arrays, None if there is nothing."""
+
+    @abc.abstractmethod
+    def check(self, population: int, network: AbstractNetwork, least: int = 1, learners: int = 0):
+        """Raise `ValueError` unless this breeds `population` members with `least` elites or more,
+        and leaves a slot to the actor of each of some learners."""
+
+    @abc.abstractmethod
+    def elites(self, population: int) -> int:
+        """Number of elites among `population` members."""
+
+    @abc.abstractmethod
+    def first(self, population: PyTree, *, key: Key) -> tuple[PyTree, PyTree]:
+        """The first population, out of one that was newly drawn, and the memory."""
+
+    @abc.abstractmethod
+    def next(
+        self, memory: PyTree, population: PyTree, fitness: Fitness, draw: Draw, *, key: Key
+    ) -> tuple[PyTree, Descent, PyTree]:
+        """The next population, of the same size, where each member comes from, and the memory.
+
+        **Arguments:** `fitness` is maximised; NaN ranks last. `draw(n, key=key)` makes `n` fresh
+        members.
+        """
+
+    @abc.abstractmethod
+    def warm(self, memory: PyTree, population: PyTree, policy: PyTree) -> tuple[PyTree, PyTree]:
+        """A first population and the memory that go on from a saved policy."""
+
+
+class Breeder(AbstractBreeder):
     """Makes the next population: elites first, best to worst, then the offspring.
 
     An offspring is a copy of a selected parent. Some are crossed with a random elite, all are
@@ -76,9 +110,7 @@ class Breeder(eqx.Module):
         if not isinstance(self.islands, Islands | None):
             raise TypeError(f"islands is {self.islands!r}: give Islands(number=4), or None")
 
-    def check(self, population: int, network: AbstractNetwork, least: int = 1, learners: int = 0):
-        """Raise `ValueError` unless this breeds `population` members with `least` elites or more,
-        and leaves a slot to the actor of each of some learners."""
+    def check(self, population, network, least=1, learners=0):
         require.at_least("population_size", population, 2)
         size = self.islands.size(population) if self.islands else population
         of = "members of an island" if self.islands else "members"
@@ -89,10 +121,19 @@ class Breeder(eqx.Module):
                 "weights of their own: give DMMU or Team(sharing='nothing'), or leave it out"
             )
 
-    def elites(self, population: int) -> int:
-        """Number of elites among `population` members, those of all islands."""
+    def elites(self, population):
+        """Those of all islands."""
         n = self.islands.number if self.islands else 1
         return n * int(self.elite_fraction * (population // n))
+
+    def first(self, population, *, key):
+        return population, None
+
+    def next(self, memory, population, fitness, draw, *, key):
+        return *self(population, fitness, draw, key=key), None
+
+    def warm(self, memory, population, policy):
+        return tree.put(population, 0, policy), None
 
     def __call__(self, population: PyTree, fitness: Fitness, draw: Draw, *, key: Key) -> Bred:
         """The next population, of the same size, and where each member comes from.
@@ -206,13 +247,23 @@ def draw(network: AbstractNetwork, sizes: tuple[int, ...], n: int, *, key: PRNGK
     return eqx.filter_vmap(lambda key: network.init(*sizes, key=key))(keys)
 
 
-def evolving(breeder: Breeder, settings: dict[str, Any], overrides: Any = None) -> dict[str, Any]:
+def evolving(
+    breeder: AbstractBreeder, settings: dict[str, Any], overrides: Any = None
+) -> dict[str, Any]:
     """An algorithm's settings, of which those that are fields of a breeder are put into one: for
-    `mutation=…` a `breeder=…`. Presets take both."""
+    `mutation=…` a `breeder=…`. Presets take both.
+
+    **Raises:** `ValueError` if a given breeder is no `Breeder` and has no such fields.
+    """
     settings = overridden(settings, overrides or {})
     own = {name: value for name, value in settings.items() if name in FIELDS}
     rest = {name: value for name, value in settings.items() if name not in FIELDS}
-    return rest | {"breeder": replace(rest.get("breeder", breeder), **own)}
+    given = rest.get("breeder", breeder)
+    if not isinstance(given, Breeder) and own:
+        raise ValueError(
+            f"{type(given).__name__} has no {', '.join(own)}: leave that out, or breed by Breeder()"
+        )
+    return rest | {"breeder": replace(given, **own)}
 
 
 def overridden(settings: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:

@@ -22,6 +22,9 @@ class Descent(eqx.Module):
     taken: Float[Array, "pop c"]
     """The share of weights that came from that mate, in [0, 1], among those in which the two
     parents differed; 0 without a crossover."""
+    parts: Float[Array, "pop old"] | None = None
+    """Of members drawn from a distribution: the weight in its mean of each old member, of which
+    `parent` is the heaviest. None: they come from parents and mates."""
 
     @classmethod
     def unchanged(cls, parent: Int[Array, " pop"], elite: bool, crossings: int) -> "Descent":

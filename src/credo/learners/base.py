@@ -21,6 +21,7 @@ from ..types import NOTHING, Batch, Metrics
 
 Learned = tuple[PyTree, Metrics]  # state and metrics
 Returns = Float[Array, "samples batch *agents"]
+Value = Float[Array, "batch *agents"]
 
 
 class AbstractLearner(eqx.Module):
@@ -58,6 +59,11 @@ class AbstractLearner(eqx.Module):
     def explorer(self, state: PyTree, random: Bool[Array, ""]) -> AbstractPolicy:
         """The actor with this learner's noise, or with random actions."""
 
+    def value(self, state: PyTree, policy: AbstractPolicy, batch: Batch) -> Value:
+        """What the critic says of the return from each observation on where `policy` acts, in units
+        of the rewards that critics see. A learner without it cannot judge or coach members."""
+        raise NotImplementedError(f"{type(self).__name__} has no value of other policies")
+
     @abc.abstractmethod
     def warm(self, state: PyTree, actor: AbstractPolicy) -> PyTree:
         """`state` that goes on from a given actor."""
@@ -81,17 +87,14 @@ def learn(learner: AbstractLearner, state, replay: Replay, updates, **rest) -> L
 @jit
 def _learn(learner, state, replay: Replay, updates, *, signal, moments=None, sampling=UNIFORM, key):
     signal = learner.signal or signal
-    learner = learner if learner.reward_scale is not None else _scaled(learner, replay, signal)
+    learner = learner if learner.reward_scale is not None else scaled(learner, replay, signal)
     dynamic, static = eqx.partition(state, eqx.is_array)
 
     def body(i, loop):
         dynamic, total = loop
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
-        given = (learner.batch_size, sampling, learner.gamma)
-        rows, discount = replay.sample(*given, together=learner.together, key=sample_key)
-        reward, ends = rows.rewards[signal], (rows.terminated, rows.truncated)
-        obs, after = seen(moments, rows.obs), seen(moments, rows.next_obs)
-        batch = Batch(obs, rows.action, reward, after, *ends, rows.active, discount)
+        how = {"signal": signal, "moments": moments, "sampling": sampling}
+        batch = minibatch(learner, replay, **how, key=sample_key)
         state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)
         return eqx.filter(state, eqx.is_array), jax.tree.map(jnp.add, total, metrics)
 
@@ -100,7 +103,16 @@ def _learn(learner, state, replay: Replay, updates, *, signal, moments=None, sam
     return eqx.combine(dynamic, static), averaged(total, updates)
 
 
-def _scaled(learner: Any, replay: Replay, signal: str) -> Any:
+def minibatch(learner, replay: Replay, *, signal, moments, sampling, key: PRNGKeyArray) -> Batch:
+    """What a learner learns from in one step."""
+    given = (learner.batch_size, sampling, learner.gamma)
+    rows, discount = replay.sample(*given, together=learner.together, key=key)
+    reward, ends = rows.rewards[signal], (rows.terminated, rows.truncated)
+    obs, after = seen(moments, rows.obs), seen(moments, rows.next_obs)
+    return Batch(obs, rows.action, reward, after, *ends, rows.active, discount)
+
+
+def scaled(learner: Any, replay: Replay, signal: str) -> Any:
     """With the scale at which the usual reward, paid at every step, makes a return of 1."""
     usual = jnp.maximum(replay.spread(signal), 1e-8)
     return replace(learner, reward_scale=jnp.maximum(1.0 - learner.gamma, 1e-4) / usual)
@@ -172,6 +184,18 @@ def act(policy: AbstractPolicy, obs: Float[Array, "batch *agents obs"]) -> Array
         return policy(obs.T, policy.start(key=None))[0].T  # pyright: ignore[reportArgumentType]
     start = policy.start(key=jax.random.key(0))
     return jax.vmap(lambda x: policy(x, start)[0])(obs)
+
+
+def require_critic(asked: Any, learners: tuple[AbstractLearner, ...]) -> None:
+    """Raise unless the first learner can say what other policies are worth."""
+    name = type(asked).__name__
+    if not learners:
+        raise ValueError(f"{name} asks a learner's critic, and there is no learner: give learners")
+    if type(learners[0]).value is AbstractLearner.value:
+        raise ValueError(
+            f"{name} asks the critic of the first learner, and {type(learners[0]).__name__} has no "
+            "method `value`: put TD3, DDPG or SAC first"
+        )
 
 
 def require_memoryless(network: AbstractNetwork, policy: AbstractPolicy) -> None:

@@ -1,9 +1,12 @@
 """Resource managers: which learner of a portfolio gets how many rollout workers.
 
-Source: Khadka (2019), section 6.2, equation 6.1 and Algorithm 10.
+Source: Khadka (2019), section 6.2, equation 6.1 and Algorithm 10; `Progress` is learning within the
+manager, named as future work in section 6.4.
 """
 
 import abc
+from dataclasses import replace
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -21,10 +24,13 @@ class Ledger(eqx.Module):
     square: Float[Array, " q"]  # running mean of their squares
     count: Int[Array, " q"]  # returns so far, y; their sum is H
     known: Bool[Array, " q"]  # whether any of them was a number
+    before: Float[Array, " q"] | None = None  # a slower running mean; 0 unless a manager keeps it
 
     @classmethod
     def empty(cls, q: int) -> "Ledger":
-        return cls(jnp.zeros(q), jnp.zeros(q), jnp.zeros(q, jnp.int32), jnp.zeros(q, bool))
+        return cls(
+            jnp.zeros(q), jnp.zeros(q), jnp.zeros(q, jnp.int32), jnp.zeros(q, bool), jnp.zeros(q)
+        )
 
     @property
     def comparable(self) -> Float[Array, " q"]:
@@ -63,6 +69,7 @@ class AbstractManager(eqx.Module):
                 jnp.where(good, ledger.square.at[i].set(square), ledger.square),
                 ledger.count.at[i].add(1),
                 ledger.known.at[i].set(ledger.known[i] | good),
+                ledger.before,
             )
             return jax.tree.map(lambda a, b: jnp.where(counts, a, b), after, ledger), None
 
@@ -124,6 +131,66 @@ class Thompson(AbstractManager):
         imagined = ledger.comparable[None] + spread[None] * drawn
         # Nothing is known of a learner that never played: it is the next to.
         return jnp.argmax(jnp.where(ledger.count[None] == 0, jnp.inf, imagined), axis=1)
+
+
+class Progress(AbstractManager):
+    """Workers by learning progress: the part of each learner is in proportion to the change of its
+    returns, whichever learner has the highest.
+
+    Progress is the difference of two running means, a fast and a slow one, of which the slow one
+    lies about 1/`slow` returns back: how steeply a learner's returns rise, in units of the reward.
+    Graves et al. (2017), "Automated curriculum learning for neural networks", section 3, pay a
+    bandit by learning progress. Departures: their gain is that of the loss on one sample, rescaled
+    by its quantiles, and the bandit is Exp3.S; here returns of one task are compared, which have
+    one scale, and chances follow progress itself. Noise in the returns of a learner that stands
+    still counts as progress too: of both means the noisier learner has the larger difference.
+    """
+
+    kind: Literal["rise", "change"] = eqx.field(static=True, default="rise")
+    """Whether progress is a rise of returns alone, or any change: a learner that gets worse is then
+    given as many frames as one that gets better."""
+    exploration: float = 0.2  # share of chances that all learners have alike, in [0, 1]
+    slow: float = 0.05  # weight of the newest return in the slow mean, in (0, memory)
+    memory: float = 0.2  # α: weight of the newest return in the fast mean, in (0, 1]
+
+    def __check_init__(self):
+        require.literals(self)
+        require.within("exploration", self.exploration, 0, 1)
+        floats = isinstance(self.slow, int | float) and isinstance(self.memory, int | float)
+        floats = floats and self.memory > 0.0  # else it is said what is wrong with the memory
+        if floats and not 0.0 < self.slow < self.memory:
+            raise ValueError(
+                f"slow is {self.slow}: it must lie above 0 and below memory, {self.memory}"
+            )
+
+    @jit
+    def observe(self, ledger, i, returns, played):
+        """And the slow mean, likewise."""
+
+        def one(loop, new):
+            slow, known = loop
+            counts = new[1] & jnp.isfinite(new[0])
+            weight = jnp.where(known, self.slow, 1.0)
+            mean = weight * new[0] + (1.0 - weight) * slow
+            return (jnp.where(counts, mean, slow), known | counts), None
+
+        assert ledger.before is not None
+        (slow, _), _ = jax.lax.scan(one, (ledger.before[i], ledger.known[i]), (returns, played))
+        after = AbstractManager.observe(self, ledger, i, returns, played)
+        return replace(after, before=ledger.before.at[i].set(slow))
+
+    def allocate(self, ledger, workers, *, key):
+        return jax.random.choice(key, ledger.value.shape[0], (workers,), p=self.chances(ledger))
+
+    def chances(self, ledger: Ledger) -> Float[Array, " q"]:
+        """Of each learner to get a worker. One that never played counts as the one with the most
+        progress."""
+        assert ledger.before is not None
+        rise = ledger.value - ledger.before
+        progress = jnp.maximum(rise, 0.0) if self.kind == "rise" else jnp.abs(rise)
+        progress = jnp.where(ledger.known, progress, jnp.max(progress)) + 1e-6
+        even = self.exploration / progress.shape[0]
+        return even + (1.0 - self.exploration) * progress / jnp.sum(progress)
 
 
 def even(workers: int, q: int) -> Int[Array, " b"]:

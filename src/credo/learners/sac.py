@@ -25,7 +25,7 @@ from ..networks.mlp import (
     linear,
 )
 from ..types import Batch, Metrics
-from .base import AbstractLearner, Returns, adam, adam_state, bellman, descend, polyak
+from .base import AbstractLearner, Returns, Value, act, adam, adam_state, bellman, descend, polyak
 
 Key = PRNGKeyArray
 Scalar = Float[Array, ""]
@@ -165,6 +165,11 @@ class SAC(AbstractLearner):
 
     def explorer(self, state: SACState, random: Bool[Array, ""]) -> AbstractPolicy:
         return Sampler(state.actor, random)
+
+    def value(self, state: SACState, policy: AbstractPolicy, batch: Batch) -> Value:
+        """By the lesser of the critics, without the policy's entropy."""
+        pair = (batch.obs.T, act(policy, batch.obs).T)
+        return jnp.min(jnp.stack([critic(*pair) for critic in state.critics]), axis=0)
 
     def warm(self, state: SACState, actor: AbstractPolicy) -> SACState:
         return eqx.tree_at(lambda s: s.actor.mean, state, actor)

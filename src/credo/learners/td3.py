@@ -23,6 +23,7 @@ from ..types import Batch, Metrics
 from .base import (
     AbstractLearner,
     Returns,
+    Value,
     act,
     adam_state,
     bellman,
@@ -155,6 +156,11 @@ class TD3(AbstractLearner):
     def explorer(self, state: TD3State, random: Bool[Array, ""]) -> AbstractPolicy:
         shape = (*state.agents, state.critics[0].action_size)
         return Explorer(state.actor, self.noise, random, shape)
+
+    def value(self, state: TD3State, policy: AbstractPolicy, batch: Batch) -> Value:
+        """By the first critic, which the actor follows too."""
+        actions = map(features_first, (act(policy, batch.obs), batch.action))
+        return state.critics[0].own(features_first(batch.obs), *actions)
 
     def warm(self, state: TD3State, actor: AbstractPolicy) -> TD3State:
         return eqx.tree_at(lambda s: (s.actor, s.target_actor), state, (actor, actor))

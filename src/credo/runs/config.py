@@ -29,12 +29,16 @@ import numpy as np
 from ..environments.base import AbstractEnvironment
 from ..environments.foreign import AbstractForeignEnvironment
 from ..environments.host import AbstractHostEnvironment
+from ..evolution.breeder import AbstractBreeder
 from ..evolution.crossover import AbstractCrossover
 from ..evolution.mutation import AbstractMutation
 from ..evolution.selection import AbstractSelection
 from ..learners.base import AbstractLearner
+from ..learners.coach import AbstractCoach
+from ..learners.horizon import AbstractHorizon
 from ..learners.manager import AbstractManager
 from ..learners.share import AbstractShare
+from ..learners.surrogate import AbstractSurrogate
 from ..networks.base import AbstractNetwork
 from ..networks.exploration import AbstractNoise
 from ..networks.mlp import AbstractCritic
@@ -54,6 +58,10 @@ EXTENSIONS = (
     AbstractCritic,
     AbstractValues,
     AbstractShare,
+    AbstractBreeder,
+    AbstractCoach,
+    AbstractSurrogate,
+    AbstractHorizon,
 )
 PACKAGES = ("credo", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
 

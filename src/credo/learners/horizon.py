@@ -1,0 +1,50 @@
+"""Horizons: the population plays the first steps of an episode, and a learner's critic says what
+the rest is worth.
+
+Source: Hao et al. (2023), "ERL-Re²: efficient evolutionary reinforcement learning with shared state
+representation and individual policy representation", whose surrogate fitness is that of H steps and
+the value of the last state.
+
+A member's fitness is its return until it is cut off and the critic's value of the state in which
+it is, with the member's own action there. All members of a generation are cut after as many steps,
+so that their fitness is comparable; a member whose episode terminated before has its return alone.
+The value is discounted by the learner's γ, while returns are not: it stands for about 1/(1 - γ)
+further steps. Tests of champions and the learners' own episodes are whole ones.
+
+Departures: they discount the H rewards too, use a value function that takes the policy as an input,
+and evaluate like this with some probability; here it is the learner's own critic, in every
+generation.
+"""
+
+import equinox as eqx
+
+from .. import require
+from .base import AbstractLearner, require_critic
+
+
+class AbstractHorizon(eqx.Module):
+    """How far the population's episodes go."""
+
+    steps: eqx.AbstractVar[int]  # most steps of an episode of the population, at least 1
+
+    def check(self, reward: str, spread: bool, learners: tuple[AbstractLearner, ...]) -> None:
+        """Raise unless the first learner has a critic, and one of the reward that is the fitness,
+        frame by frame."""
+        require_critic(self, learners)
+        signal = learners[0].signal or reward
+        if signal != reward or spread:
+            paid = "a return in equal parts" if spread else f"{signal!r}"
+            raise ValueError(
+                f"{type(self).__name__} adds the critic's value to a return of {reward!r}, and the "
+                f"first learner is paid {paid}: put a learner of {reward!r} first, without "
+                "redistribute, or leave the horizon out"
+            )
+
+
+class Truncated(AbstractHorizon):
+    """The same number of steps in every generation."""
+
+    steps: int = 200  # most steps of an episode of the population, at least 1
+
+    def __check_init__(self):
+        require.at_least("steps", self.steps, 1)

@@ -1,0 +1,113 @@
+"""Episodes of the population that are cut short, with the critic's value behind them."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from credo import tree
+from credo.algorithms.aid import play_ahead
+from credo.algorithms.erl import ERL
+from credo.environments.gymnasium import Gymnasium
+from credo.environments.probes import Copy
+from credo.evolution.breeder import draw
+from credo.learners.horizon import Truncated
+from credo.learners.td3 import TD3
+from credo.networks.mlp import MLP, Critic
+from credo.rollout import collect
+
+NETWORK = MLP((4,))
+LEARNER = TD3(critic=Critic(hidden=(4,)), batch_size=8, reward_scale=0.5)
+SMALL = {"population_size": 4, "elite_fraction": 0.25, "warmup_frames": 0, "sync_period": 1}
+
+
+def test_a_task_in_jax_is_cut_after_as_many_steps_as_data_say():
+    env, key = Copy(), jax.random.key(1)
+    population = draw(NETWORK, env.sizes, 3, key=jax.random.key(0))
+    play = jax.jit(lambda limit, key: collect(env, population, 2, limit=limit, key=key))
+    _, whole = play(jnp.int32(99), key)
+    played, new = play(jnp.int32(4), key)
+    assert play._cache_size() == 1
+    assert np.all(played.steps == 4)
+    rewards = np.asarray(whole.transitions.rewards["reward"]).reshape(3, 2, 10)
+    np.testing.assert_allclose(played.returns["reward"], rewards[..., :4].sum(axis=2), rtol=1e-5)
+    last = new.last(played)
+    assert np.all(last.truncated)
+    assert not np.any(last.terminated)
+    obs = np.asarray(whole.transitions.next_obs).reshape(6, 10, 1)
+    np.testing.assert_array_equal(last.next_obs, obs[:, 3])
+
+
+def test_a_task_outside_jax_is_cut_too_unless_it_terminates_before():
+    env, key = Gymnasium("InvertedPendulum-v5", in_process=True), jax.random.key(1)
+    population = draw(NETWORK, env.sizes, 3, key=jax.random.key(0))
+    whole, rows = collect(env, population, 2, key=key)
+    limit = int(np.median(whole.steps))
+    played, new = collect(env, population, 2, limit=jnp.int32(limit), key=key)
+    np.testing.assert_array_equal(played.steps, np.minimum(whole.steps, limit))
+    last = new.last(played)
+    fell = np.asarray(whole.steps).reshape(-1) <= limit
+    np.testing.assert_array_equal(last.terminated, fell)
+    np.testing.assert_array_equal(last.truncated, ~fell)
+    ends = np.cumsum(np.asarray(whole.steps).reshape(-1))
+    starts = ends - np.asarray(whole.steps).reshape(-1)
+    at = starts + np.asarray(played.steps).reshape(-1) - 1
+    np.testing.assert_allclose(last.next_obs, rows.transitions.next_obs[at], rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def played():
+    erl = ERL.erl(Copy(), NETWORK, learners=(LEARNER,), horizon=Truncated(3), **SMALL)
+    state, metrics = jax.jit(erl.generation)(erl.init(key=jax.random.key(0)), key=jax.random.key(1))
+    assert metrics["frames"] == 5 * 10  # nothing was learned yet, so episodes are whole
+    return erl, state
+
+
+def kept(state):
+    """With a buffer that can be given away."""
+    return replace(state, replay=jax.tree.map(jnp.copy, state.replay))
+
+
+def test_the_value_of_the_last_state_is_added_in_units_of_the_reward(played):
+    erl, state = played
+    given = (state.population, 2)
+    _, ahead = play_ahead(erl, kept(state), *given, key=jax.random.key(5))
+    before, new = collect(erl.env, *given, limit=jnp.int32(3), key=jax.random.key(5))
+    last = np.asarray(new.last(before).next_obs).reshape(4, 2, 1)
+    for i in range(4):
+        member = tree.take(state.population, i)
+        for j in range(2):
+            obs = jnp.asarray(last[i, j])
+            value = state.learners[0].critics[0](obs[:, None], member(obs, None)[0][:, None])
+            expected = float(before.returns["reward"][i, j] + value[0] / 0.5)
+            assert float(ahead.returns["reward"][i, j]) == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_population_plays_less_and_learners_play_on(played):
+    erl, state = played
+    after, metrics = jax.jit(erl.generation)(state, key=jax.random.key(2))
+    assert metrics["frames"] == 4 * 3 + 10
+    assert after.frames == state.frames + metrics["frames"]
+    assert after.replay.written == after.frames
+    long = replace(erl, horizon=Truncated(10))  # as long as an episode: nothing is added
+    _, whole = play_ahead(long, kept(state), state.population, 1, key=jax.random.key(5))
+    plain, _ = collect(erl.env, state.population, 1, key=jax.random.key(5))
+    np.testing.assert_allclose(whole.returns["reward"], plain.returns["reward"], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Truncated(0), "steps is 0"),
+        (lambda: ERL.ea(Copy(), horizon=Truncated()), "there is no learner"),
+        (
+            lambda: ERL.erl(Copy(), horizon=Truncated(), redistribute=True),
+            "the first learner is paid a return in equal parts",
+        ),
+    ],
+)
+def test_bad_horizons_are_refused(make, said):
+    with pytest.raises(ValueError, match=said):
+        make()
