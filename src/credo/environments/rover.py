@@ -137,13 +137,13 @@ class Rover(AbstractEnvironment):
     """Consecutive steps that observing a POI takes, at least 1."""
     poi_values: tuple[float, ...] | None = None  # value of each POI, above 0; None: all 1
     poi_couplings: tuple[int, ...] | None = eqx.field(static=True, default=None)
-    """Rovers that each POI needs, 1 to `coupling`; None: `coupling`, all of them."""
+    """Rovers that each POI needs, 1 to `coupling`; None: `coupling`, and decoys one."""
     poi_rings: tuple[tuple[float, float], ...] | None = None
     """For each POI the least and the greatest distance from the field's centre at which it lies, in
     metres, not within `activation_distance` of a rover; None: anywhere outside the centre."""
     decoys: int = eqx.field(static=True, default=0)
-    """The first so many POIs are decoys, which the local reward `decoys` tells from the others; 0
-    to `pois`."""
+    """The first so many POIs are decoys, which one rover observes and which the local reward
+    `decoys` tells from the others; 0 to `pois`."""
     mislead: float = 0.5
     """Share of the local reward `decoys` that points at decoys, in [0, 1]; 0: all of it points at
     the other POIs."""
@@ -217,7 +217,6 @@ class Rover(AbstractEnvironment):
             "pois": 8,
             "decoys": 4,
             "poi_values": (1.0,) * 4 + (4.0,) * 4,
-            "poi_couplings": (1,) * 4 + (coupling,) * 4,
             "poi_rings": ((4.0, 7.0),) * 4 + ((8.0, 10.0),) * 4,
             "local": "decoys",
         }
@@ -255,7 +254,8 @@ class Rover(AbstractEnvironment):
     @property
     def needed(self) -> tuple[int, ...]:
         """Rovers that each POI needs."""
-        return self.poi_couplings or (self.coupling,) * self.pois
+        alike = (1,) * self.decoys + (self.coupling,) * (self.pois - self.decoys)
+        return self.poi_couplings or alike
 
     def reset(self, *, key: PRNGKeyArray) -> tuple[RoverState, TimeStep]:
         place_key, heading_key = jax.random.split(key)
@@ -458,7 +458,7 @@ class Rover(AbstractEnvironment):
         far = jnp.full((1, self.pois), jnp.inf)  # who would replace the last rover
         padded = jnp.concatenate([distance, far])
         closest = -jax.lax.top_k(-padded.T, n + 1)[0]  # [pois, n + 1], the closest first
-        if self.poi_couplings is None:
+        if set(self.needed) == {n}:
             total = jnp.sum(closest[:, :n], axis=1)
             last, next_ = closest[:, n - 1], closest[:, n]
         else:
