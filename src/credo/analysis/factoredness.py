@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import tree
-from ..environments.base import AbstractEnvironment
+from ..environments.base import AbstractEnvironment, AbstractTask
 from ..networks.base import AbstractPolicy
 from ..networks.team import Team
 from ..rollout import evaluate
@@ -85,7 +85,7 @@ def factoredness(
     shape = (n, changes + 1, worlds)
     returns = {k: np.asarray(x).reshape(*shape, -1) for k, x in played.returns.items()}
     whole = returns[to or env.reported].mean(axis=3)
-    return {name: _agreement(x, whole, agent[:, 1:]) for name, x in returns.items()}
+    return {name: _agreement(returns[name], whole, agent[:, 1:]) for name in env.signals}
 
 
 def _agreement(own: np.ndarray, whole: np.ndarray, agent: np.ndarray) -> Agreement:
@@ -112,13 +112,16 @@ def _fresh(env: AbstractEnvironment, key: PRNGKeyArray) -> PyTree:
     return eqx.filter_vmap(lambda key: network.init(*env.sizes, key=key))(keys)
 
 
-def lines(env: AbstractEnvironment) -> list[str]:
-    """What `credo check` says of a team's rewards; nothing where there is no choice of them."""
-    if env.agents is None or len(env.signals) < 2:
+def lines(env: AbstractTask) -> list[str]:
+    """What `credo check` says of a team's rewards; nothing where there is no choice of them, or the
+    task is outside JAX."""
+    if not isinstance(env, AbstractEnvironment) or env.agents is None or len(env.signals) < 2:
         return []
     found = factoredness(env)
-    told = [f"factoredness: how often a reward agrees with {env.reported!r} about a change of one "
-            "agent's policy; 0.50 is chance"]
+    told = [
+        f"factoredness: how often a reward agrees with {env.reported!r} about a change of one "
+        "agent's policy; 0.50 is chance"
+    ]
     width = max(map(len, found))
     for name, (share, counted, tried) in found.items():
         said = f"{share:.2f}" if counted else "unknown: the team's reward never changed"

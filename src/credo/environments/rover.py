@@ -461,16 +461,20 @@ class Rover(AbstractEnvironment):
         if set(self.needed) == {n}:
             total = jnp.sum(closest[:, :n], axis=1)
             last, next_ = closest[:, n - 1], closest[:, n]
+            count = count_without = n
         else:
-            n = jnp.array(self.needed)
-            counts = jnp.arange(self.coupling + 1)[None] < n[:, None]
-            total = jnp.sum(closest, axis=1, where=counts)
-            last, next_ = (jnp.take_along_axis(closest, i[:, None], 1)[:, 0] for i in (n - 1, n))
-            n = n.astype(jnp.float32)
+            needed = jnp.array(self.needed)
+            among = jnp.arange(n + 1)[None] < needed[:, None]
+            total = jnp.sum(closest, axis=1, where=among)
+            ends = [jnp.take_along_axis(closest, needed[:, None] - 1 + i, axis=1) for i in (0, 1)]
+            last, next_ = (x[:, 0] for x in ends)
+            count = needed.astype(jnp.float32)
+            count_without = count[None]
         total_without = jnp.where(
             distance <= last[None], total[None] - distance + next_[None], total[None]
         )
-        return d_a / jnp.maximum(d_a, total / n), d_a / jnp.maximum(d_a, total_without / n)
+        near = d_a / jnp.maximum(d_a, total / count)
+        return near, d_a / jnp.maximum(d_a, total_without / count_without)
 
     def _local(
         self,

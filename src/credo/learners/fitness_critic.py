@@ -52,7 +52,12 @@ class AbstractFitnessCritic(eqx.Module):
 
     @abc.abstractmethod
     def update(
-        self, state: PyTree, obs: Rows, action: Rows, returns: Float[Array, "n *agents"], active: Any
+        self,
+        state: PyTree,
+        obs: Rows,
+        action: Rows,
+        returns: Float[Array, "n *agents"],
+        active: Any,
     ) -> tuple[PyTree, Float[Array, ""]]:
         """One gradient step towards the returns of the episodes. **Returns:** also the error."""
 
