@@ -30,7 +30,7 @@ def test_it_learns_what_places_are_worth(sharing):
     critic = replace(TINY, sharing=sharing, learning_rate=1e-2)
     state = critic.init(1, 1, 2, key=jax.random.key(0))
     place = jax.random.uniform(jax.random.key(1), (256, 2, 1))
-    returns = (place > 0.5).astype(jnp.float32)[..., 0] * jnp.array([1.0, -1.0])
+    returns = (place > 0.5).astype(jnp.float32)[..., 0] * jnp.array([[1.0, -1.0]])
     learn = jax.jit(lambda s: critic.update(s, place, 0 * place, returns, None))
     for _ in range(200):
         state, _ = learn(state)
@@ -112,14 +112,15 @@ def test_ccea_resumes_bit_for_bit(tmp_path):
 
 def test_a_learner_is_paid_by_the_critic():
     """The reward in the batch is what the critic learns; the learner sees what the critic says."""
-    inner = TD3(**(TEAM | {"critic": Critic(hidden=(8,)), "gamma": 0.0, "reward_scale": 1.0}))
+    inner = TD3(**(TEAM | {"critic": Critic(hidden=(8,)), "gamma": 0.0, "critic_lr": 0.01}))
     learner = Criticised(inner, Known(), gain=True)
     state = learner.init(Team(trunk=(4,)), 2, 1, 3, key=jax.random.key(0))
     obs = jax.random.normal(jax.random.key(1), (5, 3, 2))
     none, what = jnp.zeros((5, 3), bool), jnp.full((5, 3), 7.0)
     batch = Batch(obs, jnp.zeros((5, 3, 1)), what, obs + 2.0, none, none)
+    update = jax.jit(learner.update)
     for _ in range(300):
-        state, metrics = jax.jit(learner.update)(state, batch, key=jax.random.key(2))
+        state, metrics = update(state, batch, key=jax.random.key(2))
     assert float(metrics["q"]) == pytest.approx(2.0, abs=0.1)  # what it rose by, not 7
     assert set(metrics) == set(learner.metrics)
 

@@ -157,8 +157,8 @@ class Rover(AbstractEnvironment):
     unobserved: to the closest of those unobserved before the step; it falls after an observation,
     so that to hover outside the ring pays. closeness: min(1, d_a / distance) to that one, as coded;
     the same, and to end the episode costs. progress: metres by which the step came closer to that
-    one; nothing is lost by observing it. decoys: `mislead` times the closeness to decoys alone, 0 once
-    all of them are observed, and 1 - `mislead` times the progress to the other POIs alone."""
+    one; nothing is lost by observing it. decoys: `mislead` times the closeness to decoys alone, 0
+    once all of them are observed, and 1 - `mislead` times the progress to the other POIs alone."""
     rewards: tuple[str, ...] = eqx.field(static=True, default=("global", "local"))
     """Rewards by name: global, local, mixed, difference, dpp; the first is what training
     maximises."""
