@@ -80,8 +80,9 @@ def factoredness(
     team, change = np.meshgrid(np.arange(n), np.arange(changes + 1), indexing="ij")
     agent = np.where(change == 0, -1, (team + change) % agents)
     other = (team + 1 + (change % (n - 1))) % n
-    two = (tree.take(teams, jnp.asarray(x.reshape(-1))) for x in (team, other))
-    played = evaluate(env, Changed(*two, jnp.asarray(agent.reshape(-1))), worlds, key=play_key)
+    mine, theirs = (tree.take(teams, jnp.asarray(x.reshape(-1))) for x in (team, other))
+    changed = Changed(mine, theirs, jnp.asarray(agent.reshape(-1)))
+    played = evaluate(env, changed, worlds, key=play_key)
     shape = (n, changes + 1, worlds)
     returns = {k: np.asarray(x).reshape(*shape, -1) for k, x in played.returns.items()}
     whole = returns[to or env.reported].mean(axis=3)

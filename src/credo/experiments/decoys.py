@@ -90,7 +90,7 @@ UNSHAPED: dict[str, dict[str, Any]] = {
     "ea": {"learners": ()},
     "merl, return spread": {"learners": (RETURN,), "network": ALIKE, "redistribute": True},
     "merl, fitness critic": {
-        "learners": (Criticised(RETURN),),
+        "learners": (Criticised(RETURN),),  # pyright: ignore[reportCallIssue]
         "network": ALIKE,
         "redistribute": True,
     },
