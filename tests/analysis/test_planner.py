@@ -197,3 +197,23 @@ def test_baselines_and_bound_are_means_over_the_same_worlds(scarce):
     assert bound == pytest.approx(scarce[1].mean(), abs=0.15)
     assert kind == "upper bound"
     assert not bounds.exact(SCARCE)
+
+
+def test_the_bound_counts_what_each_poi_needs():
+    """Two rovers at 0, 8 m of way: a decoy to the left and a POI for both to the right."""
+    fields = {"activation_distance": 1.0, "max_steps": 8, "poi_values": (1.0, 4.0)}
+    env = Rover(rovers=2, pois=2, coupling=2, decoys=1, **fields)
+    there = start(env, [(0, 0), (0, 0)], [(-9, 0), (9, 0)])[0]
+    assert bound_from(env, there) == pytest.approx(0.8)  # not 1: nobody is left for the decoy
+    third = dataclasses.replace(env, rovers=3)
+    assert bound_from(third, start(third, [(0, 0)] * 3, [(-9, 0), (9, 0)])[0]) == 1.0
+
+
+def test_baselines_of_decoys():
+    env = Rover.misleading(coupling=3)
+    begun = starts(dataclasses.replace(env, rewards=("global",)), 20, key=jax.random.key(0))
+    bound = bounds_of(env, begun[0])
+    scripted = scripted_team(dataclasses.replace(env, rewards=("global",)), begun)
+    assert (scripted <= bound + 1e-6).all()
+    assert scripted.mean() > 0.95
+    assert bound.mean() == 1.0

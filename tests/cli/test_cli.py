@@ -593,6 +593,30 @@ def test_the_rewards_of_a_task_are_named():
     assert (env.rewards, env.coupling) == (("global", "local", "dpp"), 2)
 
 
+def test_decoys_and_fitness_critics_have_words():
+    def made(words):
+        line = Line("train", words.split())
+        return train._algorithm(line, line.command(train.Train))
+
+    ccea = made(
+        "ccea rover-decoys --coupling 4 --mislead 0.25 --critic perceptron --critic.hidden 8"
+    )
+    assert ccea.env == load("environments.rover:Rover").misleading(4, 0.25)
+    assert ccea.env.needed == (1, 1, 1, 1, 4, 4, 4, 4)
+    assert ccea.critic.hidden == (8,)
+    merl = made("merl rover --learners criticised --redistribute --learners.0.critic.hidden 8")
+    assert merl.learners[0].critic.hidden == (8,)
+    assert merl.learners[0].signal == "global"
+
+
+def test_check_tells_how_often_the_rewards_of_a_team_agree(credo):
+    code, out, _ = credo("check rover --rovers 2 --coupling 1 --pois 2 --max-steps 5 --size 8")
+    assert code == 0
+    told = dict(line.split(maxsplit=1) for line in out.splitlines() if line.startswith("  "))
+    assert told["global"].startswith("1.00")
+    assert 0 <= float(told["local"].split()[0]) <= 1
+
+
 def test_the_best_policy_can_be_asked_for(credo, run, tmp_path):
     for flag, name in (("", "champion"), ("--best", "best")):
         assert credo(f"evaluate {run} --episodes 20 {flag}")[0] == 0

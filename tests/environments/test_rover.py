@@ -529,3 +529,90 @@ def test_its_picture_shows_pois_and_rovers_where_they_are():
     assert picture[10, 190].tolist() == [255, 255, 255]
     seen = eqx.tree_at(lambda s: s.observed, state, jnp.array([True]))
     assert env.render(seen, pixels=200)[150, 150].tolist() == [200, 16, 46]
+
+
+# Decoys
+
+
+def test_decoys_lie_near_and_the_others_far_and_nothing_is_observed_at_the_start():
+    env = Rover.misleading(coupling=3)
+    state, _ = jax.jit(jax.vmap(lambda key: env.reset(key=key)))(
+        jax.random.split(jax.random.key(0), 300)
+    )
+    radius = np.linalg.norm(np.asarray(state.poi) - 10.0, axis=2)
+    assert 4.0 <= radius[:, :4].min() < 4.6
+    assert 6.8 < radius[:, :4].max() <= 7.0 + 1e-5
+    assert 8.0 - 1e-5 <= radius[:, 4:].min() < 8.1
+    assert 9.9 < radius[:, 4:].max() <= 10.0 + 1e-5
+    # Uniform in the ring: half of its area lies beyond the root of the mean square.
+    assert abs((radius[:, 4:] > np.sqrt(0.5 * (8**2 + 10**2))).mean() - 0.5) < 0.05
+    away = state.position[:, :, None] - state.poi[:, None]
+    assert np.linalg.norm(away, axis=3).min() >= 3.0
+
+
+def test_a_decoy_needs_one_rover_and_another_poi_the_coupling():
+    pois = [(0, 0), (50, 0)]
+    fields = {"coupling": 2, "decoys": 1, "poi_values": (1.0, 4.0), "max_steps": 2}
+    env, state, _ = scene([(0, 0), (50, 0)], pois, **fields)
+    assert env.needed == (1, 2)
+    state, _ = step(env, state, (0, 0.0), (0, 0.0))
+    assert np.asarray(state.observed).tolist() == [True, False]
+    _, now = step(env, state, (0, 0.0), (0, 0.0))
+    assert float(now.rewards["global"]) == pytest.approx(0.2)
+    env, state, _ = scene([(50, 0), (50, 1)], pois, **fields)
+    state, _ = step(env, state, (0, 0.0), (0, 0.0))
+    assert np.asarray(state.observed).tolist() == [False, True]
+    other = Rover(coupling=3, pois=2, poi_couplings=(2, 3))
+    assert other.needed == (2, 3)
+
+
+def test_d_plus_plus_of_pois_that_differ():
+    """One copy more would observe the second POI, which needs two; the first needs three."""
+    fields = {"coupling": 3, "poi_couplings": (3, 2), "poi_values": (3.0, 1.0), "max_steps": 1}
+    env, state, _ = scene([(0, 0), (50, 0), (99, 9)], [(0, 0), (50, 0)], rewards=("dpp",), **fields)
+    _, now = step(env, state, (0, 0.0), (0, 0.0), (0, 0.0))
+    np.testing.assert_allclose(now.rewards["dpp"], [0.75 / 2, 0.25, 0.0])
+
+
+def test_graded_with_couplings_of_their_own():
+    fields = {"coupling": 2, "poi_couplings": (1, 2), "graded": True, "max_steps": 1}
+    env, state, _ = scene([(0, 0), (0, 8)], [(0, 6), (0, 12)], rewards=("global",), **fields)
+    _, now = step(env, state, (0, 0.0), (0, 0.0))
+    assert float(now.rewards["global"]) == pytest.approx(0.5 * 1.0 + 0.5 * 3 / 8)
+
+
+@pytest.mark.parametrize(
+    ("mislead", "paid"),
+    [
+        (0.0, [1.0, 1.0, 1.0, 1.0]),
+        (1.0, [0.75, 1.0, 0.0, 0.0]),
+        (0.25, [0.9375, 1.0, 0.75, 0.75]),
+    ],
+)
+def test_the_misleading_reward_of_a_rover_that_passes_a_decoy(mislead, paid):
+    """Along +x: a decoy 5 m ahead, observed from 3 m in the second step, and another POI at 20."""
+    fields = {"coupling": 1, "decoys": 1, "local": "decoys", "mislead": mislead}
+    env, state, _ = scene([(0, 0)], [(5, 0), (20, 0)], **fields)
+    found = []
+    for _ in range(4):
+        before, (state, now) = state, step(env, state, (0, 1.0))
+        found.append(float(now.rewards["local"][0]))
+    # The decoy is paid once more in the step that observes it, as with `closeness`.
+    assert found == pytest.approx(paid)
+    assert not np.asarray(before.observed)[1]
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"poi_couplings": (1, 2)}, "poi_couplings has 2 numbers for 4 POIs"),
+        ({"poi_couplings": (1, 2, 3, 4)}, "coupling is 4"),
+        ({"poi_rings": ((1.0, 2.0),)}, "poi_rings has 1 pairs for 4 POIs"),
+        ({"poi_rings": ((2.0, 1.0),) * 4}, "greatest distance of a ring is 1.0"),
+        ({"decoys": 5}, "decoys is 5"),
+        ({"mislead": 1.5}, "mislead is 1.5"),
+    ],
+)
+def test_impossible_decoys_are_refused(fields, told):
+    with pytest.raises(ValueError, match=re.escape(told)):
+        Rover(coupling=3, **fields)

@@ -38,7 +38,8 @@ from credo.runs.store import Run
 
 CHAPTERS = ("5", "6", "td3", "learners")
 ON_MUJOCO = [x for x in catalogue.EXPERIMENTS if x.partition("-")[2].startswith(CHAPTERS)]
-ON_ROVERS = ("fig-7.1", "fig-7.4", "fig-7.5", "beyond-7", "check-spread")
+DECOYS = ("beyond-7-decoys", "beyond-7-critics")
+ON_ROVERS = ("fig-7.1", "fig-7.4", "fig-7.5", "beyond-7", *DECOYS, "check-spread")
 GENERATIONS, FRAMES = 20, 100  # per generation
 TEAMS = ("check-spread", "fig-7.5")  # of which runs are measured here; others have a planner
 

@@ -20,6 +20,7 @@ Departures from the printed box:
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar, Literal, Self
 
@@ -33,12 +34,14 @@ from ..compilation import float32, jit
 from ..evolution.breeder import Breeder, draw, evolving
 from ..evolution.extinction import Extinction
 from ..evolution.selection import rankable
+from ..learners.fitness_critic import AbstractFitnessCritic
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.mlp import MLP
 from ..networks.team import Team, TeamPolicy
 from ..normalization import Moments, behind, frozen, play
 from ..rollout import Environment, evaluate
 from ..types import Metrics
+from .criticism import Criticism, judged
 from .fitness import objective
 
 Members = Int[Array, "agents teams"]
@@ -51,6 +54,7 @@ class CCEAState(eqx.Module):
     populations: PyTree  # leaves [M, k, ...]; bred, not yet evaluated
     champion: AbstractPolicy  # the best of each population, together
     moments: Moments | None  # of all observations; None: they are not normalised
+    criticism: Criticism | None = None  # None: returns alone are fitness
 
 
 class CCEA(eqx.Module):
@@ -72,6 +76,9 @@ class CCEA(eqx.Module):
     """Fitness of an individual: the `mean` over its teams, or the `best` of them."""
     fitness: str | None = eqx.field(static=True, default=None)
     """Name of the reward that is assigned; None: the task\'s first."""
+    critic: AbstractFitnessCritic | None = None
+    """Judges individuals by single steps: fitness is the most that it says of any step of theirs,
+    in place of the return that it predicts. None: fitness is the return."""
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Policies see observations normalised by the running mean and variance of all observations so
     far, which are recorded for it; the champion keeps them."""
@@ -131,7 +138,11 @@ class CCEA(eqx.Module):
         first = jnp.zeros((self.agents, 1), jnp.int32)
         moments = Moments.first(self.env, self.network) if self.normalize_observations else None
         champion = frozen(moments, tree.take(drafted(self, populations, first), 0))
-        return CCEAState(populations, champion, moments)
+        state = CCEAState(populations, champion, moments)
+        if self.critic is None:
+            return state
+        begun = Criticism.first(self.critic, self.env, jax.random.fold_in(key, 1))
+        return replace(state, criticism=begun)
 
     @float32()
     def generation(self, state: CCEAState, *, key: PRNGKeyArray) -> tuple[CCEAState, Metrics]:
@@ -142,8 +153,14 @@ class CCEA(eqx.Module):
         members = self.drawn(key=team_key)
         teams = drafted(self, state.populations, members)
         # 7-8: run z independent simulations for team T_i; assign reward to each of its members.
-        played, moments = play(self.env, teams, self.simulations, state.moments, key=play_key)
-        fitness = assigned(self, members, played.returns[self.reward])
+        metrics, criticised = {}, None
+        if self.critic is None:
+            played, moments = play(self.env, teams, self.simulations, state.moments, key=play_key)
+            rewards = played.returns[self.reward]
+        else:
+            found = judged(self, teams, state, key=play_key)
+            played, moments, criticised, rewards, metrics["critic_loss"] = found
+        fitness = assigned(self, members, rewards)
         # 9-21: for each population: rank, keep the elites, select, mutate; now and then extinction.
         best = jnp.argmax(rankable(fitness), axis=1)
         champion = behind(state.moments, drafted(self, state.populations, best[:, None]))
@@ -151,14 +168,14 @@ class CCEA(eqx.Module):
 
         test = evaluate(self.env, champion, self.test_episodes, key=test_key)
         returns = played.of(self.reward)
-        metrics = {
+        metrics |= {
             "fitness_max": jnp.max(rankable(jnp.mean(returns, axis=1))),
             "fitness_mean": jnp.nanmean(returns),
             "fitness_nan": jnp.sum(jnp.isnan(jnp.mean(returns, axis=1))),
             "champion_score": jnp.mean(test.of(self.env.reported)),
             "frames": jnp.sum(played.steps),
         }
-        return CCEAState(populations, tree.take(champion, 0), moments), metrics
+        return CCEAState(populations, tree.take(champion, 0), moments, criticised), metrics
 
     def drawn(self, *, key: PRNGKeyArray) -> Members:
         """Who is in which team."""

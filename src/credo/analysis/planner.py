@@ -104,7 +104,9 @@ def scripted_team(env: Rover, starts: Start) -> Float[np.ndarray, " worlds"]:
     It forms floor(rovers / coupling) groups, at most as many as POIs, and spare rovers join them.
     Up to 4 POIs every division among the groups in every order is rated by the way to go, and the
     best 16 are played in the environment; beyond, each POI in turn goes to the group that gets
-    there first. A group drives to the near side of its next POI and waits there for all its rovers.
+    there first; where POIs differ in coupling, and 4 or fewer need a whole group, divisions of
+    these are played too, with the others behind them. A group drives to the near side of its next
+    POI and waits there for all its rovers.
     Groups never mix, so where time is short a better team may exist; the bound says how much.
     """
     state = starts[0]
@@ -120,14 +122,14 @@ def bound_from(env: Rover, state: RoverState) -> float:
     Proof. Who was within d_a of POI a and later of POI b has driven at least |ab| - 2·d_a between,
     and |sa| - d_a from its start s to the first: where the sum over a sequence of POIs exceeds
     `max_steps` times the highest speed, no rover visits them in that sequence, so each rover visits
-    one of the sets for which some sequence remains. An observed POI was visited by `coupling`
-    rovers or more, so the observed ones are covered that often by one choice of such a set per
+    one of the sets for which some sequence remains. An observed POI was visited by as many rovers
+    as it needs or more, so the observed ones are covered that often by one choice of such a set per
     rover, and the greatest value over all choices bounds the reward. Where there are too many
-    POIs for that the sets are forgotten, and each POI counts that `coupling` rovers reach alone.
+    POIs for that the sets are forgotten, and each POI counts that enough rovers reach alone.
 
-    With `graded` each POI counts d_a / max(d_a, m): m is the mean over its `coupling` closest
-    rovers of how near each could come at all. The mean at any step is no smaller, and an observed
-    POI has m <= d_a.
+    With `graded` each POI counts d_a / max(d_a, m): m is the mean over its closest rovers, as many
+    as it needs, of how near each could come at all. The mean at any step is no smaller, and an
+    observed POI has m <= d_a.
     """
     position, poi = (np.asarray(x, np.float64) for x in (state.position, state.poi))
     values = np.asarray(env.values, np.float64)
@@ -135,14 +137,15 @@ def bound_from(env: Rover, state: RoverState) -> float:
     range_ = _speed(env) * env.max_steps * (1 + 1e-5) + 1e-4  # beyond the rounding of float32
     way = _distances(position, poi)
     if env.graded:
-        nearest = np.sort(np.maximum(way - range_, 0.0), axis=0)[: env.coupling].mean(axis=0)
+        nearest = np.sort(np.maximum(way - range_, 0.0), axis=0).T
+        nearest = np.array([x[:n].mean() for x, n in zip(nearest, env.needed, strict=True)])
         return min(1.0, float(values @ (d_a / np.maximum(d_a, nearest))))
-    if (env.coupling + 1) ** env.pois > STATES:
-        reached = (way - d_a <= range_).sum(axis=0) >= env.coupling
+    if math.prod(n + 1 for n in env.needed) > STATES:
+        reached = (way - d_a <= range_).sum(axis=0) >= np.array(env.needed)
         return min(1.0, float(values @ reached))
     between = np.maximum(_distances(poi, poi) - 2 * d_a, 0.0)
     sets = [_visitable(np.maximum(row - d_a, 0.0), between, range_) for row in way]
-    return min(1.0, _best_cover(sets, values, env.coupling))
+    return min(1.0, _best_cover(sets, values, env.needed))
 
 
 def baselines(env: Rover, worlds: int = WORLDS, *, draws: int = 10) -> dict[str, float]:
@@ -240,11 +243,14 @@ def _plan(env: Rover, rovers: Float[np.ndarray, "rovers 2"], poi: Float[np.ndarr
     """The plans for one world that are worth playing: the fields of `Plans`."""
     groups = min(env.agents // env.coupling, env.pois)
     way = np.linalg.norm(poi - rovers.mean(axis=0), axis=1)
+    between, chosen = _distances(poi, poi), np.empty((0, groups, env.pois), np.int32)
     if env.pois > EXHAUSTIVE:
-        chosen = _nearest_next(groups, way, _distances(poi, poi))[None]
-    else:
-        routes = _divisions(groups, env.pois)
-        chosen = routes[_best(env, routes, way, _distances(poi, poi))]
+        chosen = _nearest_next(groups, way, between)[None]
+    whole = np.flatnonzero(np.array(env.needed) == env.coupling)  # groups
+    if len(whole) <= EXHAUSTIVE:
+        routes = _with_rest(_divisions(groups, len(whole)), whole, env.pois)
+        best = _best(env, routes[..., : len(whole)], way, between)
+        chosen = np.concatenate([chosen, routes[best]])[:KEPT]
     made = [_lay_out(env, route, rovers, poi) for route in chosen]
     aim, group = (np.stack(x) for x in zip(*made, strict=True))
     return chosen, aim.astype(np.float32), group
@@ -260,6 +266,20 @@ def _divisions(groups: int, pois: int) -> Int[np.ndarray, "plans groups pois"]:
             parts = [order[a:b] for a, b in itertools.pairwise(edges)]
             plans.append([(*part, *[-1] * (pois - len(part))) for part in parts])
     return np.array(plans, np.int32)
+
+
+def _with_rest(routes: np.ndarray, whole: np.ndarray, pois: int) -> Int[np.ndarray, "plans g p"]:
+    """Divisions of the POIs `whole`, by their numbers there, and behind them in turn the others."""
+    rest = [p for p in range(pois) if p not in whole]
+    plans, groups, _ = routes.shape
+    routes = np.where(routes >= 0, whole[routes], -1)
+    behind = np.full((groups, len(rest)), -1)
+    for turn, poi in enumerate(rest):
+        behind[turn % groups, turn // groups] = poi
+    behind = np.broadcast_to(behind, (plans, *behind.shape))
+    routes = np.concatenate([routes, behind], axis=2)
+    order = np.argsort(routes < 0, axis=2, kind="stable")  # -1 behind the last
+    return np.take_along_axis(routes, order, axis=2).astype(np.int32)
 
 
 def _best(env: Rover, routes, way, between) -> Int[np.ndarray, " plans"]:
@@ -351,11 +371,11 @@ def _visitable(first: np.ndarray, between: np.ndarray, range_: float) -> list[in
     return [a for a in able if not any(a != b and a & b == a for b in able)]
 
 
-def _best_cover(sets: list[list[int]], values: np.ndarray, coupling: int) -> float:
-    """The greatest value of POIs that lie in `coupling` sets or more, one set per rover."""
+def _best_cover(sets: list[list[int]], values: np.ndarray, needed: tuple[int, ...]) -> float:
+    """The greatest value of POIs that lie in as many sets as each needs, one set per rover."""
     pois = len(values)
-    counts = np.zeros((coupling + 1,) * pois, bool)
-    counts[(0,) * pois] = True  # reachable numbers of visitors, more than `coupling` as `coupling`
+    counts = np.zeros([n + 1 for n in needed], bool)
+    counts[(0,) * pois] = True  # reachable numbers of visitors, more than needed as needed
     for choices in sets:
         reached = np.zeros_like(counts) if choices else counts
         for chosen in choices:
@@ -369,4 +389,4 @@ def _best_cover(sets: list[list[int]], values: np.ndarray, coupling: int) -> flo
                     grown = np.moveaxis(after, 0, poi)
             reached = reached | grown
         counts = reached
-    return float(((np.argwhere(counts) >= coupling) @ values).max())
+    return float(((np.argwhere(counts) >= np.array(needed)) @ values).max())

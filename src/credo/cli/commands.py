@@ -171,7 +171,8 @@ class Report:
 
 @dataclasses.dataclass
 class Check:
-    """Look for mistakes in a task. Flags of the task, such as --max-episode-steps, change it."""
+    """Look for mistakes in a task, and of a team in JAX how often its rewards agree. Flags of the
+    task, such as --max-episode-steps, change it."""
 
     task: str
     _: dataclasses.KW_ONLY
@@ -184,6 +185,7 @@ class Check:
 
     def __call__(self, line: Line) -> None:
         """List what is wrong; exit code 1 if anything is."""
+        from ..analysis import factoredness
         from ..environments import checks
         from ..environments.host import AbstractHostEnvironment
         from . import tasks
@@ -196,6 +198,8 @@ class Check:
         problems = tasks.problems(env)
         for problem in problems:
             print(f"- {problem}")
+        for told in [] if problems else factoredness.lines(env):
+            print(told)
         print(f"{self.task}: {len(problems)} problem{'s' * (len(problems) != 1)} found")
         raise SystemExit(1 if problems else 0)
 

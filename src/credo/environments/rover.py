@@ -136,17 +136,29 @@ class Rover(AbstractEnvironment):
     harvest_period: int = eqx.field(static=True, default=1)
     """Consecutive steps that observing a POI takes, at least 1."""
     poi_values: tuple[float, ...] | None = None  # value of each POI, above 0; None: all 1
+    poi_couplings: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    """Rovers that each POI needs, 1 to `coupling`; None: `coupling`, and decoys one."""
+    poi_rings: tuple[tuple[float, float], ...] | None = None
+    """For each POI the least and the greatest distance from the field's centre at which it lies, in
+    metres, not within `activation_distance` of a rover; None: anywhere outside the centre."""
+    decoys: int = eqx.field(static=True, default=0)
+    """The first so many POIs are decoys, which one rover observes and which the local reward
+    `decoys` tells from the others; 0 to `pois`."""
+    mislead: float = 0.5
+    """Share of the local reward `decoys` that points at decoys, in [0, 1]; 0: all of it points at
+    the other POIs."""
     graded: bool = eqx.field(static=True, default=False)
     """An unobserved POI pays the share max over time of d_a / max(d_a, mean distance of the
     `coupling` closest rovers) of its value (d_a: `activation_distance`)."""
-    local: Literal["distance", "unobserved", "closeness", "progress"] = eqx.field(
+    local: Literal["distance", "unobserved", "closeness", "progress", "decoys"] = eqx.field(
         static=True, default="distance"
     )
     """distance: minus the metres to the closest POI, observed or not; a rover may stay there.
     unobserved: to the closest of those unobserved before the step; it falls after an observation,
     so that to hover outside the ring pays. closeness: min(1, d_a / distance) to that one, as coded;
     the same, and to end the episode costs. progress: metres by which the step came closer to that
-    one; nothing is lost by observing it."""
+    one; nothing is lost by observing it. decoys: `mislead` times the closeness to decoys alone, 0
+    once all of them are observed, and 1 - `mislead` times the progress to the other POIs alone."""
     rewards: tuple[str, ...] = eqx.field(static=True, default=("global", "local"))
     """Rewards by name: global, local, mixed, difference, dpp; the first is what training
     maximises."""
@@ -174,6 +186,7 @@ class Rover(AbstractEnvironment):
                 f"coupling is {self.coupling} and there are {self.agents} rovers: no POI could "
                 "ever be observed; give at least as many rovers as the coupling"
             )
+        require.within("mislead", self.mislead, 0, 1)
         _check_rewards(self)
         _check_pois(self)
 
@@ -194,6 +207,20 @@ class Rover(AbstractEnvironment):
             "placed": (((9.0, 10.0), (14.0, 17.0)), ((1.0, 1.0), (1.0, 18.0))),
         }
         return cls(**(preset | overrides))
+
+    @classmethod
+    def misleading(cls, coupling: int = 3, mislead: float = 0.5, **overrides) -> "Rover":
+        """Four decoys near the start, worth a fifth of all, which one rover observes, and four POIs
+        farther away that need `coupling`. The local reward pays a rover to stay beside a decoy that
+        nobody observes, the more the greater `mislead` is. `overrides`: fields."""
+        preset = {
+            "pois": 8,
+            "decoys": 4,
+            "poi_values": (1.0,) * 4 + (4.0,) * 4,
+            "poi_rings": ((4.0, 7.0),) * 4 + ((8.0, 10.0),) * 4,
+            "local": "decoys",
+        }
+        return cls(**(preset | {"coupling": coupling, "mislead": mislead} | overrides))
 
     @property
     def agents(self) -> int:
@@ -223,6 +250,12 @@ class Rover(AbstractEnvironment):
             return jnp.full(self.pois, 1.0 / self.pois)
         values = jnp.stack([jnp.asarray(value, jnp.float32) for value in self.poi_values])
         return values / jnp.sum(values)
+
+    @property
+    def needed(self) -> tuple[int, ...]:
+        """Rovers that each POI needs."""
+        alike = (1,) * self.decoys + (self.coupling,) * (self.pois - self.decoys)
+        return self.poi_couplings or alike
 
     def reset(self, *, key: PRNGKeyArray) -> tuple[RoverState, TimeStep]:
         place_key, heading_key = jax.random.split(key)
@@ -299,17 +332,18 @@ class Rover(AbstractEnvironment):
 
     def viewer(self) -> Viewer:
         """Rovers from above, and what each senses."""
-        needed = f"{self.coupling} rover{'s' * (self.coupling > 1)}"
+        counts = sorted(set(self.needed))
+        several = " or ".join(map(str, counts)) + f" rover{'s' * (counts != [1])}"
         return Viewer(
             "rover",
-            f"{self.agents} rovers and {self.pois} POIs, each of which is observed once {needed} "
-            f"{'are' if self.coupling > 1 else 'is'} within {float(self.activation_distance):g} m "
+            f"{self.agents} rovers and {self.pois} POIs, each of which is observed once {several} "
+            f"{'is' if counts == [1] else 'are'} within {float(self.activation_distance):g} m "
             "of it at the same time.",
             self.shown,
             {
                 "size": np.float32(self.size),
                 "activation_distance": np.float32(self.activation_distance),
-                "coupling": self.coupling,
+                "needed": np.array(self.needed),
                 "observation": self.observation,
             },
             LEGEND,
@@ -354,16 +388,28 @@ class Rover(AbstractEnvironment):
         spread = jax.random.uniform(rover_key, (self.agents, 2), minval=-1.0, maxval=1.0)
         position = middle + half * spread
         drawn = self.size * jax.random.uniform(poi_key, (self.pois, CANDIDATES, 2))
-        outside = jnp.max(jnp.abs(drawn - middle), axis=2) > half
+        outside, away = jnp.max(jnp.abs(drawn - middle), axis=2) > half, CLEARANCE
+        if self.poi_rings is not None:
+            drawn, away = self._in_rings(drawn / self.size), self.activation_distance
+            outside = jnp.ones_like(outside)
         # One reduction, so that nothing of [pois, candidates, rovers] is ever in memory.
         x = drawn[:, :, None, 0] - position[None, None, :, 0]
         y = drawn[:, :, None, 1] - position[None, None, :, 1]
         clear = jnp.sqrt(jnp.min(x * x + y * y, axis=2))
-        valid = outside & (clear >= CLEARANCE)
+        valid = outside & (clear >= away)
         # The first valid one is uniform over what is valid. If none is, as on a tiny field, the
         # farthest one comes closest to what was asked.
         chosen = jnp.argmax(jnp.where(valid, jnp.inf, jnp.where(outside, clear, -1.0)), axis=1)
         return position, drawn[jnp.arange(self.pois), chosen]
+
+    def _in_rings(self, u: Float[Array, "pois n 2"]) -> Float[Array, "pois n 2"]:
+        """Places, uniform in the ring of each POI, from numbers uniform in [0, 1]."""
+        assert self.poi_rings is not None
+        rings = jnp.stack([jnp.asarray(x, jnp.float32) for ring in self.poi_rings for x in ring])
+        least, most = rings.reshape(-1, 2).T[:, :, None] ** 2
+        radius, angle = jnp.sqrt(least + (most - least) * u[..., 0]), 2 * math.pi * u[..., 1]
+        way = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=2)
+        return 0.5 * self.size + radius[..., None] * way
 
     def _move(self, state: RoverState, action: Float[Array, "rovers 2"]):
         """Positions (m), headings (rad) and speeds (m per step) after clipped actions."""
@@ -399,7 +445,7 @@ class Rover(AbstractEnvironment):
 
     def _harvest(self, observed, held, count):
         """Who is observed, and for how long already, when `count` rovers are there."""
-        enough = count >= self.coupling
+        enough = count >= jnp.broadcast_to(jnp.array(self.needed), count.shape)
         if held is None:
             return observed | enough, None
         held = jnp.where(enough, held + 1, 0)
@@ -412,12 +458,23 @@ class Rover(AbstractEnvironment):
         far = jnp.full((1, self.pois), jnp.inf)  # who would replace the last rover
         padded = jnp.concatenate([distance, far])
         closest = -jax.lax.top_k(-padded.T, n + 1)[0]  # [pois, n + 1], the closest first
-        total = jnp.sum(closest[:, :n], axis=1)
-        last, next_ = closest[:, n - 1], closest[:, n]
+        if set(self.needed) == {n}:
+            total = jnp.sum(closest[:, :n], axis=1)
+            last, next_ = closest[:, n - 1], closest[:, n]
+            count = count_without = n
+        else:
+            needed = jnp.array(self.needed)
+            among = jnp.arange(n + 1)[None] < needed[:, None]
+            total = jnp.sum(closest, axis=1, where=among)
+            ends = [jnp.take_along_axis(closest, needed[:, None] - 1 + i, axis=1) for i in (0, 1)]
+            last, next_ = (x[:, 0] for x in ends)
+            count = needed.astype(jnp.float32)
+            count_without = count[None]
         total_without = jnp.where(
             distance <= last[None], total[None] - distance + next_[None], total[None]
         )
-        return d_a / jnp.maximum(d_a, total / n), d_a / jnp.maximum(d_a, total_without / n)
+        near = d_a / jnp.maximum(d_a, total / count)
+        return near, d_a / jnp.maximum(d_a, total_without / count_without)
 
     def _local(
         self,
@@ -428,13 +485,20 @@ class Rover(AbstractEnvironment):
         """Each rover's own reward; `observed` and distances `was` before the step."""
         if self.local == "distance":
             return -jnp.min(distance, axis=1)
-        left = jnp.where(jnp.all(observed), jnp.zeros_like(observed), observed)[None]
+        if self.local == "decoys":
+            decoy = jnp.arange(self.pois) < self.decoys
+            stay = self._closeness(observed | ~decoy, distance)  # 0 if all are left out
+            come = _progress(observed | decoy, was, distance)
+            return self.mislead * stay + (1.0 - self.mislead) * come
+        left = jnp.where(jnp.all(observed), jnp.zeros_like(observed), observed)
         if self.local == "progress":
-            mine = jnp.argmin(jnp.where(left, jnp.inf, was), axis=1)[:, None]
-            return jnp.take_along_axis(was - distance, mine, axis=1)[:, 0]
-        closest = jnp.min(jnp.where(left, jnp.inf, distance), axis=1)
+            return _progress(left, was, distance)
         if self.local == "unobserved":
-            return -closest
+            return -_closest(left, distance)
+        return self._closeness(left, distance)
+
+    def _closeness(self, left_out: Bool[Array, " pois"], distance) -> Float[Array, " rovers"]:
+        closest = _closest(left_out, distance)
         return self.activation_distance / jnp.maximum(self.activation_distance, closest)
 
     def _pay(
@@ -470,7 +534,7 @@ class Rover(AbstractEnvironment):
     ) -> Float[Array, " rovers"]:
         """With m copies of rover i a POI gains if its company with i was ever `coupling` - m."""
         new = (company > 0) & ~observed[None]
-        missing = jnp.where(new, self.coupling - company, self.coupling)
+        missing = jnp.where(new, jnp.array(self.needed)[None] - company, self.coupling)
         gains = [difference]  # per copy, for m = 0 (see the class), 1, 2, ...
         for copies in range(1, self.coupling):
             gains.append(self._share(missing <= copies, None) / copies)
@@ -513,6 +577,19 @@ def _apart(a: Float[Array, "a 2"], b: Float[Array, "b 2"]):
     x = b[None, :, 0] - a[:, None, 0]
     y = b[None, :, 1] - a[:, None, 1]
     return (x, y), jnp.sqrt(x * x + y * y)
+
+
+def _closest(left_out: Bool[Array, " pois"], distance) -> Float[Array, " rovers"]:
+    """Metres to the closest POI of those that are not left out."""
+    return jnp.min(jnp.where(left_out[None], jnp.inf, distance), axis=1)
+
+
+def _progress(left_out: Bool[Array, " pois"], was, distance) -> Float[Array, " rovers"]:
+    """Metres by which the step came closer to what was the closest POI of those that are not left
+    out; 0 if all are."""
+    was = jnp.where(jnp.all(left_out), distance, was)
+    mine = jnp.argmin(jnp.where(left_out[None], jnp.inf, was), axis=1)[:, None]
+    return jnp.take_along_axis(was - distance, mine, axis=1)[:, 0]
 
 
 def _bracket(ahead: Float[Array, "..."], left: Float[Array, "..."]) -> Int[Array, "..."]:
@@ -597,13 +674,20 @@ def _check_rewards(env: Rover) -> None:
 
 def _check_pois(env: Rover) -> None:
     """Raise `ValueError` unless values and places are as many as POIs and rovers."""
-    if env.poi_values is not None:
-        if len(env.poi_values) != env.pois:
-            raise ValueError(
-                f"poi_values has {len(env.poi_values)} numbers for {env.pois} POIs: give one each"
-            )
-        for value in env.poi_values:
-            require.at_least("a POI's value", value, 1e-6)
+    lists = {"poi_values": "numbers", "poi_couplings": "numbers", "poi_rings": "pairs"}
+    for name, what in lists.items():
+        given = getattr(env, name)
+        if given is not None and len(given) != env.pois:
+            told = f"{name} has {len(given)} {what} for {env.pois} POIs"
+            raise ValueError(f"{told}: give one each")
+    for value in env.poi_values or ():
+        require.at_least("a POI's value", value, 1e-6)
+    for needed in env.poi_couplings or ():
+        require.within("a POI's coupling", needed, 1, env.coupling)
+    require.within("decoys", env.decoys, 0, env.pois)
+    for least, most in env.poi_rings or ():
+        require.at_least("the least distance of a ring", least, 0)
+        require.at_least("the greatest distance of a ring", most, least)
     if env.placed is not None and tuple(map(len, env.placed)) != (env.agents, env.pois):
         raise ValueError(
             f"placed has {len(env.placed[0])} rovers and {len(env.placed[1])} POIs: there are "

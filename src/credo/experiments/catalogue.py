@@ -43,6 +43,8 @@ EXPERIMENTS = {
     "fig-7.4": "rover domain, coupling 1 to 7",
     "fig-7.5": "paths of teams at coupling 3",
     "beyond-7": "difference rewards, levels of credit, memory, sharing",
+    "beyond-7-decoys": "decoys: a local reward that misleads, by a dial",
+    "beyond-7-critics": "15 rovers from the team's reward alone, fitness critics",
     "check-spread": "MADDPG and MATD3 on simple_spread",
 }
 
@@ -62,6 +64,7 @@ MODULES = {  # of this folder, with the experiments that each has
     "runtime": ("note-5.5",),
     "portfolios": ("fig-6.2", "fig-6.3", "fig-6.4", "fig-6.5", "table-6.1", "beyond-6"),
     "rovers": ("fig-7.1", "fig-7.4", "beyond-7"),
+    "decoys": ("beyond-7-decoys", "beyond-7-critics"),
     "paths": ("fig-7.5",),
     "check_spread": ("check-spread",),
 }

@@ -9,6 +9,7 @@ the updates per frame: the author's programs make one, and a plan with fewer is 
 import dataclasses
 from typing import Any, NamedTuple
 
+from ..learners.fitness_critic import Criticised
 from ..networks.mlp import Critic, ResidualCritic
 from ..networks.team import JointCritic, Team
 from ..report.rows import Labels
@@ -82,6 +83,8 @@ def shrunk(algorithm: Any) -> Any:
 
 
 def _learner(learner: Any) -> Any:
+    if isinstance(learner, Criticised):
+        return dataclasses.replace(learner, learner=_learner(learner.learner))
     return dataclasses.replace(learner, critic=_critic(learner.critic), batch_size=16)
 
 

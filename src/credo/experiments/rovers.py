@@ -36,10 +36,11 @@ METHODS: dict[str, tuple[str, str]] = {  # what learns, and from which reward
     "merl": ("merl", "local"),
     "ea": ("ea", "global"),
     **{f"td3 {reward}": ("td3", reward) for reward in ("local", "mixed", "global")},
-    **{f"matd3 {reward}": ("matd3", reward) for reward in ("mixed", "global")},
+    **{f"matd3 {reward}": ("matd3", reward) for reward in ("local", "mixed", "global")},
     **{f"maddpg {reward}": ("maddpg", reward) for reward in ("mixed", "global")},
 }
-COMPARED = [method for method in METHODS if method not in ("td3 mixed", "td3 global")]
+OTHERS = ("td3 mixed", "td3 global", "matd3 local")  # of other figures than 7.4
+COMPARED = [method for method in METHODS if method not in OTHERS]
 LEARNERS = {"matd3": matd3, "maddpg": maddpg}
 
 

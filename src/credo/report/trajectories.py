@@ -140,9 +140,9 @@ def _counts(axes: Axes, env: Rover, shown: Mapping[str, np.ndarray], t: int) -> 
     """Below each POI, how many rovers are inside its ring at step `t`, of those that it takes; or
     that it was observed."""
     offset = {"textcoords": "offset points", "xytext": (0, -16), "ha": "center", "fontsize": 8}
-    now = (shown["poi"], shown["observed"][t], shown["inside"][t])
-    for place, seen, inside in zip(*now, strict=True):
-        text = "observed" if seen else f"{inside} of {env.coupling}"
+    now = (shown["poi"], shown["observed"][t], shown["inside"][t], env.needed)
+    for place, seen, inside, needed in zip(*now, strict=True):
+        text = "observed" if seen else f"{inside} of {needed}"
         axes.annotate(text, place, color=SEEN[LIGHT] if seen else LIGHT.ink, zorder=5, **offset)
 
 

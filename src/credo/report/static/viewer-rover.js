@@ -1,7 +1,7 @@
 /* Rovers on their field, and what the chosen one senses. */
 credo.draw(view => {
 const {field, panel, task, add, html, set, number, color} = view;
-const TURN = 2 * Math.PI, n = task.coupling, reach = task.activation_distance;
+const TURN = 2 * Math.PI, reach = task.activation_distance;
 const at = (radius, angle) => `${radius * Math.cos(angle)} ${-radius * Math.sin(angle)}`;
 const who = html(panel, 'h2', {class: 'who'});
 const sensors = add(panel, 'svg', {class: 'sensors', viewBox: '-100 -100 200 200', role: 'img'});
@@ -40,8 +40,8 @@ function build(episode) {
   drawn = {};
 }
 
-function ring([x, y]) {
-  const r = reach, gap = n > 1 ? Math.min(0.12, 1 / n) : 0;
+function ring([x, y], j) {
+  const r = reach, n = task.needed[j], gap = n > 1 ? Math.min(0.12, 1 / n) : 0;
   const disc = add(field, 'circle', {class: 'reach', cx: x, cy: -y, r});
   const arcs = Array.from({length: n}, (_, k) => {
     const from = TURN / 4 - TURN * k / n - gap / 2, to = TURN / 4 - TURN * (k + 1) / n + gap / 2;
@@ -93,7 +93,7 @@ function draw(time) {
     `${t === steps ? 'is' : 'would be'} ${number(game.share[t])}` +
     (t === steps ? '.' : ' if the episode ended here; it is paid at the end.');
   set(field, 'aria-label', `The field from above at step ${t}: ` + game.poi.map((p, j) =>
-    `POI ${j} ` + (game.observed[t][j] ? 'observed' : `${game.inside[t][j]} of ${n} inside`)).join(', '));
+    `POI ${j} ` + (game.observed[t][j] ? 'observed' : `${game.inside[t][j]} of ${task.needed[j]} inside`)).join(', '));
 }
 
 function drawPoi(j, t, pixel) {
@@ -106,7 +106,7 @@ function drawPoi(j, t, pixel) {
   const since = game.observed.findIndex(row => row[j]);
   /* Among many POIs, labels of those where a rover is. */
   if (game.poi.length > 20 && (seen || !inside)) label.textContent = '';
-  else label.textContent = seen ? `\u2713 step ${since}` : `${inside} of ${n}`;
+  else label.textContent = seen ? `\u2713 step ${since}` : `${inside} of ${task.needed[j]}`;
   set(label, 'class', seen.trim());
   set(label, 'y', -y + 20 * pixel);
   label.style.fontSize = `${12 * pixel}px`;

@@ -1,0 +1,126 @@
+"""Beyond chapter 7: when the reward of each agent misleads, and when there is none.
+
+beyond-7-decoys: near the rovers lie decoys, POIs of low value that one rover observes; farther away
+lie POIs of high value that need `coupling` rovers. A share of the local reward, the dial, pays a
+rover to stay beside a decoy that nobody observes; the rest pays for coming closer to the others.
+The learner alone, in four forms, evolution alone, and MERL, at equal frames and updates.
+
+beyond-7-critics: 15 rovers, four POIs worth 1, 2, 3 and 4 that need four rovers each, paid by the
+global reward alone: CCEA with and without a fitness critic (published, Rockefeller et al. 2020: a
+median of 0 without, 6.27 of 10 with), evolution of one policy for all, MERL on the team's return.
+
+Designs and settings were chosen on seeds from 1,000 on; reported runs have those from 0 on.
+"""
+
+import dataclasses
+from typing import Any
+
+from ..algorithms.ccea import CCEA
+from ..algorithms.merl import LOCAL, MERL
+from ..analysis.factoredness import factoredness
+from ..environments.rover import Rover
+from ..learners.fitness_critic import Criticised, FitnessCritic
+from ..networks.mlp import MLP
+from ..networks.team import Team
+from . import measures
+from .base import Cell, Experiment
+from .plans import Plan, planned
+from .rovers import MEASURES, SHARE, cell, curves, rewards, table
+from .views import Curves, Table, known
+
+METHODS = ("merl", "ea", "td3 local", "matd3 local", "matd3 mixed", "matd3 global")
+DIAL = {"smoke": (0.5,), "quick": (0.0, 0.5)}
+COUPLINGS = {"smoke": (3,), "quick": (3,)}
+PLANS = {
+    "smoke": Plan(1_500, 2, 0.05),
+    "quick": Plan(60_000, 2, 0.05),
+    "full": Plan(250_000, 3, 0.05),
+}
+FACTORED = "factoredness of the local reward"
+
+
+def decoys(budget: str) -> list[Cell]:
+    """Every method at every share of misleading steps."""
+    return [
+        cell(method, budget, PLANS[budget], env, coupling=n, mislead=share)
+        for n in COUPLINGS.get(budget, (3, 4))
+        for share in DIAL.get(budget, (0.0, 0.1, 0.25, 0.5, 1.0))
+        for method in METHODS
+        for env in [Rover.misleading(n, share, rewards=rewards(method))]
+    ]
+
+
+def agreement(env: Rover) -> dict[str, float]:
+    """How often the local reward agrees with the global one, of teams that nobody trained."""
+    return {FACTORED: round(factoredness(env)["local"].share, 3)}
+
+
+OVER_DIAL = Curves(
+    SHARE,
+    "mislead",
+    ["method"],
+    ["coupling"],
+    title="Coupling {coupling}: final champions by the share of the local reward that misleads",
+    y_label="share of the POIs' value",
+    levels={"random": known("random"), "greedy script": known("greedy")},
+    y_range=(0.0, 1.0),
+)
+AGREEMENT = Table(
+    "How often the local reward agrees with the global one",
+    ["coupling", "mislead"],
+    {FACTORED: known(FACTORED)},
+    caption="Of changes of one rover's policy that alter the global return of a team of untrained "
+    "networks, the share in which its own reward changes in the same direction; 0.5 is chance.",
+)
+
+# ------------------------------------------------------------------------ from the team's reward
+
+WORTH = (1.0, 2.0, 3.0, 4.0)
+CRITIC_PLANS = {
+    "smoke": Plan(1_500, 2, 0.05),
+    "quick": Plan(300_000, 2, 0.01),
+    "full": Plan(2_000_000, 3, 0.01),
+}
+ALIKE = Team(sharing="everything")
+SMALL: dict[str, Any] = {"population_size": 50, "episodes": 2}
+RETURN = dataclasses.replace(LOCAL, signal="global", reward_scale=50.0)
+"""What an episode paid in all stands for a return of 1."""
+UNSHAPED: dict[str, dict[str, Any]] = {
+    "ea, one policy for all": {"learners": (), "network": ALIKE},
+    "ea": {"learners": ()},
+    "merl, return spread": {"learners": (RETURN,), "network": ALIKE, "redistribute": True},
+    "merl, fitness critic": {
+        "learners": (Criticised(RETURN),),  # pyright: ignore[reportCallIssue]
+        "network": ALIKE,
+        "redistribute": True,
+    },
+}
+
+
+def critics(budget: str) -> list[Cell]:
+    """Methods that see the global reward alone."""
+    env = Rover(rovers=15, coupling=4, poi_values=WORTH, rewards=("global",))
+    plan, labels = CRITIC_PLANS[budget], {"coupling": 4, "task": "15 rovers"}
+    found = [
+        planned({"method": x, **labels}, MERL.merl(env, **SMALL, **fields), plan, budget)
+        for x, fields in UNSHAPED.items()
+    ]
+    alone = {"teams": 1, "episodes": 1, "population_size": 50}
+    for method, critic in (("ccea", None), ("ccea, fitness critic", FitnessCritic())):
+        algorithm = CCEA.ccea(env, MLP(hidden=(20,)), critic=critic, **alone)
+        of_method = {"method": method, **labels}
+        found.append(Cell(of_method, algorithm, range(plan.runs), frames=plan.frames))
+    return found
+
+
+EXPERIMENTS = {
+    "beyond-7-decoys": Experiment(
+        decoys,
+        (*MEASURES, measures.where(measures.of_task(agreement), method="td3 local")),
+        (OVER_DIAL, AGREEMENT, table("coupling", "mislead", "method")),
+        PLANS,
+    ),
+    "beyond-7-critics": Experiment(
+        critics, MEASURES, (table("method"), curves("task")), CRITIC_PLANS
+    ),
+}
