@@ -20,6 +20,7 @@ from ..compilation import float32, jit, repeat
 from ..evolution.breeder import Breeder, draw
 from ..evolution.selection import rankable, ranking
 from ..learners.base import AbstractLearner, learn
+from ..learners.credit import AbstractRedistribution
 from ..learners.manager import UCB, AbstractManager, Ledger, even
 from ..learners.share import AbstractShare
 from ..networks.base import AbstractNetwork, AbstractPolicy
@@ -51,6 +52,7 @@ class HybridState(eqx.Module):
     score: Float[Array, ""] = _field(-jnp.inf, jnp.float32)
     """Of the champion that was tested last; -inf: none was."""
     share: Float[Array, ""] = _field(0.0, jnp.float32)  # of the frames that the learners get
+    known: PyTree = None  # what a redistribution knows
     frames: Int[Array, ""] = _field(0, jnp.int32)
     episodes: Int[Array, ""] = _field(0, jnp.int32)
     generation: Int[Array, ""] = _field(0, jnp.int32)
@@ -68,7 +70,7 @@ class Hybrid(eqx.Module):
     workers: eqx.AbstractVar[int]
     manager: eqx.AbstractVar[AbstractManager | None]
     share: eqx.AbstractVar[AbstractShare | None]
-    redistribute: eqx.AbstractVar[bool]
+    redistribute: eqx.AbstractVar[AbstractRedistribution | None]
     sampling: eqx.AbstractVar[Sampling]
     updates_per_frame: eqx.AbstractVar[float]
     warmup_frames: eqx.AbstractVar[int]
@@ -137,7 +139,14 @@ class Hybrid(eqx.Module):
             moments=moments,
             seen=moments,
             share=jnp.float32(self.share.first() if self.share else 0.0),
+            known=self._known(key=jax.random.fold_in(key, 1 + q)),
         )
+
+    def _known(self, *, key: PRNGKeyArray) -> PyTree:
+        """What a redistribution knows at the start."""
+        if self.redistribute is None or not self.learners:
+            return None
+        return self.redistribute.init(self.env, self.rounds, self.replay_capacity, key=key)
 
     def warm(self, state: HybridState, policy: AbstractPolicy) -> HybridState:
         """`state` that goes on from a saved policy: it becomes the first member and the actor of
@@ -171,9 +180,14 @@ def play(hybrid: Hybrid, state: HybridState, policies, episodes: int, **how) -> 
     policies = behind(state.moments, policies)
     played, experience = collect(hybrid.env, policies, episodes, **how)
     state = replace(state, seen=watched(state.seen, experience))
-    if state.replay is not None:
-        new = experience.spread(played) if hybrid.redistribute else experience
-        state = replace(state, replay=extend(state.replay, new.transitions, new.valid))
+    if state.replay is None:
+        return state, played
+    how = hybrid.redistribute
+    new = experience if how is None else how.stored(experience, played)
+    state = replace(state, replay=extend(state.replay, new.transitions, new.valid))
+    if how is not None:
+        known = how.noted(state.known, state.replay, experience, played)
+        state = replace(state, known=known)
     return state, played
 
 
@@ -257,11 +271,16 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
     ready = (state.frames >= hybrid.warmup_frames) & bool(hybrid.learners)
     updates = jnp.where(ready, frames.astype(jnp.float32) * hybrid.updates_per_frame, 0.0)
     updates = updates.astype(jnp.int32)
-    learned, metrics = [], {"updates": updates}
+    learned, metrics, replay = [], {"updates": updates}, state.replay
+    if hybrid.redistribute is not None and hybrid.learners:
+        fresh = jax.random.fold_in(key, len(hybrid.learners))
+        given = (state.known, replay, state.seen, frames)
+        known, replay, told = hybrid.redistribute.taught(*given, key=fresh)
+        state, metrics = replace(state, known=known), metrics | told
     how = {"signal": hybrid.reward, "moments": state.seen, "sampling": hybrid.sampling}
     for i, learner in enumerate(hybrid.learners):
         given = how | {"key": jax.random.fold_in(key, i)}
-        after, report = learn(learner, state.learners[i], state.replay, updates, **given)
+        after, report = learn(learner, state.learners[i], replay, updates, **given)
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}
     state = replace(state, learners=tuple(learned), moments=state.seen)

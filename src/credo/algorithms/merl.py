@@ -36,6 +36,7 @@ from .. import require
 from ..compilation import float32
 from ..evolution.breeder import Breeder, evolving
 from ..learners.base import AbstractLearner
+from ..learners.credit import AbstractRedistribution
 from ..learners.share import AbstractShare
 from ..learners.td3 import TD3, TEAM
 from ..networks.base import AbstractNetwork
@@ -75,8 +76,8 @@ class MERL(Hybrid):
     test_every: int = eqx.field(static=True, default=1)  # generations from test to test, ≥ 1
     fitness: str | None = eqx.field(static=True, default=None)
     """Name of the reward that fitness sums up; None: the task\'s first."""
-    redistribute: bool = eqx.field(static=True, default=False)
-    """Learners see each episode's return in equal parts over its frames, however late it came."""
+    redistribute: AbstractRedistribution | None = None
+    """How learners are paid an episode's return where it comes late; None: as the task pays."""
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Policies see observations normalised by the running mean and variance of all observations so
     far; the champion keeps them."""

@@ -33,6 +33,7 @@ from ..evolution.crossover import AbstractCrossover
 from ..evolution.mutation import AbstractMutation
 from ..evolution.selection import AbstractSelection
 from ..learners.base import AbstractLearner
+from ..learners.credit import AbstractRedistribution
 from ..learners.manager import AbstractManager
 from ..learners.share import AbstractShare
 from ..networks.base import AbstractNetwork
@@ -54,6 +55,7 @@ EXTENSIONS = (
     AbstractCritic,
     AbstractValues,
     AbstractShare,
+    AbstractRedistribution,
 )
 PACKAGES = ("credo", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
 
