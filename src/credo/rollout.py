@@ -48,7 +48,7 @@ class Experience(eqx.Module):
             paid[np.cumsum(lived)[lived > 0] - 1] = False
             return np.bincount(np.repeat(np.arange(lived.size), lived), paid, lived.size) == 0
         paid = paid.reshape(lived.size, -1)
-        return ~jnp.any(paid & (jnp.arange(paid.shape[1]) < lived[:, None] - 1), axis=1)
+        return ~jnp.any(paid & (jnp.arange(paid.shape[1])[None] < lived[:, None] - 1), axis=1)
 
     def spread(self, played: Evaluation, late_only: bool = False) -> "Experience":
         """With every return of an episode, of whatever signal, paid in equal parts over its frames.

@@ -63,7 +63,7 @@ class Differences(AbstractPrediction):
     def loss(self, model, part, target, key):
         whose, read = _pieces(part, self.pieces)
         error = jnp.square(_said(model, part, whose) - target[:, None])
-        steps = jnp.where(jnp.arange(error.shape[1]) < read[:, None], error, 0.0)
+        steps = jnp.where(jnp.arange(error.shape[1])[None] < read[:, None], error, 0.0)
         last = jnp.take_along_axis(error, read[:, None] - 1, axis=1)[:, 0]
         steps = jnp.sum(steps, axis=1) / read.astype(jnp.float32)
         return jnp.mean(last + self.continuous * steps), None
@@ -77,7 +77,7 @@ class Differences(AbstractPrediction):
 
 def _pieces(part: Part, most: int) -> tuple[Float[Array, "episodes steps pieces"], Array]:
     """1 where a step belongs to a piece; and how many pieces each episode has."""
-    length, steps = jnp.maximum(part.length, 1)[:, None], jnp.arange(part.steps)
+    length, steps = jnp.maximum(part.length, 1)[:, None], jnp.arange(part.steps)[None]
     read = jnp.minimum(length, most)
     piece = jnp.where(steps < length, steps * read // length, most)
     return jax.nn.one_hot(piece, min(most, part.steps)), read[:, 0]
@@ -89,8 +89,11 @@ def _said(model: AbstractPolicy, part: Part, whose: Array) -> Float[Array, "epis
     share = whose / jnp.maximum(jnp.sum(whose, axis=1, keepdims=True), 1.0)
     x = jnp.einsum("etp,etx->epx", share, x)
 
+    def step(carry, x):
+        said, carry = model(x, carry)
+        return carry, said[0]
+
     def read(pieces):
-        start = model.start(key=jax.random.key(0))
-        return jax.lax.scan(lambda carry, x: model(x, carry)[::-1], start, pieces)[1][:, 0]
+        return jax.lax.scan(step, model.start(key=jax.random.key(0)), pieces)[1]
 
     return LIMIT * jax.vmap(read)(x)

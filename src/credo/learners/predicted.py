@@ -56,7 +56,9 @@ class Part(eqx.Module):
 
     def every(self) -> Frames:
         """What happened at every step. What stands behind an episode's length means nothing."""
-        return self.at(jnp.broadcast_to(jnp.arange(self.steps), (len(self.length), self.steps)))
+        return self.at(
+            jnp.broadcast_to(jnp.arange(self.steps)[None], (len(self.length), self.steps))
+        )
 
 
 class Episodes(eqx.Module):
@@ -89,8 +91,9 @@ class Episodes(eqx.Module):
         there = jnp.where(self.start + self.length <= first, self.length, 0)
         old, new = (self.start, there, self.value, self.late), (start, length, value, late)
         ring = [x.at[slot].set(y, mode="drop") for x, y in zip(old, new, strict=True)]
+        ring = dict(zip(("start", "length", "value", "late"), ring, strict=True))
         more = jnp.sum(kept.astype(jnp.int32))
-        return Episodes(*ring, self.written + more, self.fresh + more, self.turn)
+        return replace(self, **ring, written=self.written + more, fresh=self.fresh + more)
 
     def whole(self, replay: Replay) -> Bool[Array, " n"]:
         """Which of them are to be redistributed and have all their rows in the buffer."""
@@ -231,9 +234,9 @@ def _paid(how, known: Known, part, whole: Array, scale: Array) -> Known:
         past = (episodes.turn + place - fresh) % jnp.clip(episodes.written, 1, n)
         at = jnp.where(place < fresh, (episodes.written - 1 - place) % n, past)
         start, length = episodes.start[at], episodes.length[at]
-        there = (steps < length[:, None]) & (place < fresh + again)[:, None]
-        there &= start[:, None] + steps >= replay.written - capacity
-        rows = (start[:, None] + steps) % capacity
+        there = (steps[None] < length[:, None]) & (place < fresh + again)[:, None]
+        there &= start[:, None] + steps[None] >= replay.written - capacity
+        rows = (start[:, None] + steps[None]) % capacity
         said = scale * how.rewards(known.model, part(start, length))
         said = _summing(jnp.where(there, said, 0.0), episodes.value[at], length)
         said = jnp.where(whole[at][:, None], said, true[rows])
