@@ -128,6 +128,7 @@ class Hybrid(eqx.Module):
         pairs = zip(self.learners, keys, strict=True)
         population = draw(network, env.sizes, k, key=population_key)
         moments = Moments.first(env, network) if self.normalize_observations else None
+        how, given = self.redistribute, (env, self.rounds, self.replay_capacity)
         return HybridState(
             population=population,
             lineage=Lineage.first(k, q),
@@ -139,14 +140,8 @@ class Hybrid(eqx.Module):
             moments=moments,
             seen=moments,
             share=jnp.float32(self.share.first() if self.share else 0.0),
-            known=self._known(key=jax.random.fold_in(key, 1 + q)),
+            known=how.init(*given, key=jax.random.fold_in(key, 1 + q)) if how and q else None,
         )
-
-    def _known(self, *, key: PRNGKeyArray) -> PyTree:
-        """What a redistribution knows at the start."""
-        if self.redistribute is None or not self.learners:
-            return None
-        return self.redistribute.init(self.env, self.rounds, self.replay_capacity, key=key)
 
     def warm(self, state: HybridState, policy: AbstractPolicy) -> HybridState:
         """`state` that goes on from a saved policy: it becomes the first member and the actor of
@@ -180,15 +175,20 @@ def play(hybrid: Hybrid, state: HybridState, policies, episodes: int, **how) -> 
     policies = behind(state.moments, policies)
     played, experience = collect(hybrid.env, policies, episodes, **how)
     state = replace(state, seen=watched(state.seen, experience))
-    if state.replay is None:
-        return state, played
-    how = hybrid.redistribute
-    new = experience if how is None else how.stored(experience, played)
-    state = replace(state, replay=extend(state.replay, new.transitions, new.valid))
-    if how is not None:
-        known = how.noted(state.known, state.replay, experience, played)
-        state = replace(state, known=known)
+    if state.replay is not None and hybrid.redistribute is not None:
+        state = _noted(hybrid.redistribute, state, experience, played)
+    elif state.replay is not None:
+        state = replace(
+            state, replay=extend(state.replay, experience.transitions, experience.valid)
+        )
     return state, played
+
+
+def _noted(how: AbstractRedistribution, state: HybridState, experience, played) -> HybridState:
+    """With a rollout in the replay buffer, and its episodes known to the redistribution."""
+    new = how.stored(experience, played)
+    replay = extend(state.replay, new.transitions, new.valid)
+    return replace(state, replay=replay, known=how.noted(state.known, replay, experience, played))
 
 
 def breed(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key) -> Result:
@@ -273,10 +273,8 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
     updates = updates.astype(jnp.int32)
     learned, metrics, replay = [], {"updates": updates}, state.replay
     if hybrid.redistribute is not None and hybrid.learners:
-        fresh = jax.random.fold_in(key, len(hybrid.learners))
-        given = (state.known, replay, state.seen, frames)
-        known, replay, told = hybrid.redistribute.taught(*given, key=fresh)
-        state, metrics = replace(state, known=known), metrics | told
+        state, replay, told = _paid(hybrid, state, frames, key=key)
+        metrics |= told
     how = {"signal": hybrid.reward, "moments": state.seen, "sampling": hybrid.sampling}
     for i, learner in enumerate(hybrid.learners):
         given = how | {"key": jax.random.fold_in(key, i)}
@@ -286,6 +284,15 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
     state = replace(state, learners=tuple(learned), moments=state.seen)
     counted = {"frames": state.frames + frames, "episodes": state.episodes + episodes}
     return replace(state, **counted), metrics
+
+
+def _paid(hybrid, state: HybridState, frames: Frames, *, key: Key):
+    """What the redistribution knows with new `frames`, the buffer as it pays learners, and
+    metrics."""
+    given = (state.known, state.replay, state.seen, frames)
+    fresh = jax.random.fold_in(key, len(hybrid.learners))
+    known, replay, told = hybrid.redistribute.taught(*given, key=fresh)
+    return replace(state, known=known), replay, told
 
 
 def inject(hybrid: Hybrid, state: HybridState, due: Bool[Array, ""]) -> HybridState:
