@@ -248,7 +248,7 @@ def test_fitness_is_the_true_return_however_it_is_paid(how):
     true = rollout.evaluate(*given, key=jax.random.split(key, 6)[0]).of("reward")
     generation = jax.jit(erl.generation)
     state, metrics = generation(state, key=key)
-    assert metrics["fitness_max"] == pytest.approx(jnp.max(jnp.mean(true, axis=1)), rel=1e-5)
+    assert metrics["fitness_max"] == pytest.approx(float(jnp.max(jnp.mean(true, axis=1))), rel=1e-5)
     state, metrics = generation(state, key=jax.random.key(2))
     assert np.isfinite(metrics["critic_loss_0"])
     if state.known is not None:

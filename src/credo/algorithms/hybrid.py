@@ -128,7 +128,6 @@ class Hybrid(eqx.Module):
         pairs = zip(self.learners, keys, strict=True)
         population = draw(network, env.sizes, k, key=population_key)
         moments = Moments.first(env, network) if self.normalize_observations else None
-        how, given = self.redistribute, (env, self.rounds, self.replay_capacity)
         return HybridState(
             population=population,
             lineage=Lineage.first(k, q),
@@ -140,8 +139,13 @@ class Hybrid(eqx.Module):
             moments=moments,
             seen=moments,
             share=jnp.float32(self.share.first() if self.share else 0.0),
-            known=how.init(*given, key=jax.random.fold_in(key, 1 + q)) if how and q else None,
+            known=self.redistribute and self._known(key=jax.random.fold_in(key, 1 + q)),
         )
+
+    def _known(self, *, key: PRNGKeyArray) -> PyTree:
+        """What a redistribution knows at the start; None if there are no learners."""
+        how, given = self.redistribute, (self.env, self.rounds, self.replay_capacity)
+        return how.init(*given, key=key) if how is not None and self.learners else None
 
     def warm(self, state: HybridState, policy: AbstractPolicy) -> HybridState:
         """`state` that goes on from a saved policy: it becomes the first member and the actor of
@@ -178,9 +182,8 @@ def play(hybrid: Hybrid, state: HybridState, policies, episodes: int, **how) -> 
     if state.replay is not None and hybrid.redistribute is not None:
         state = _noted(hybrid.redistribute, state, experience, played)
     elif state.replay is not None:
-        state = replace(
-            state, replay=extend(state.replay, experience.transitions, experience.valid)
-        )
+        replay = extend(state.replay, experience.transitions, experience.valid)
+        state = replace(state, replay=replay)
     return state, played
 
 
