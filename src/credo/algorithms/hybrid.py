@@ -176,14 +176,12 @@ def play(hybrid: Hybrid, state: HybridState, policies, episodes: int, **how) -> 
     All of a generation act by the moments of those before; learners learn by those with what was
     `seen` since.
     """
-    policies = behind(state.moments, policies)
-    played, experience = collect(hybrid.env, policies, episodes, **how)
-    state = replace(state, seen=watched(state.seen, experience))
+    played, new = collect(hybrid.env, behind(state.moments, policies), episodes, **how)
+    state = replace(state, seen=watched(state.seen, new))
     if state.replay is not None and hybrid.redistribute is not None:
-        state = _noted(hybrid.redistribute, state, experience, played)
+        state = _noted(hybrid.redistribute, state, new, played)
     elif state.replay is not None:
-        replay = extend(state.replay, experience.transitions, experience.valid)
-        state = replace(state, replay=replay)
+        state = replace(state, replay=extend(state.replay, new.transitions, new.valid))
     return state, played
 
 
@@ -276,32 +274,29 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
     updates = updates.astype(jnp.int32)
     learned, metrics, replay = [], {"updates": updates}, state.replay
     if hybrid.redistribute is not None and hybrid.learners:
-        state, replay, told = _paid(hybrid, state, frames, key=key)
-        metrics |= told
+        state, replay, metrics = _paid(hybrid, state, frames, metrics, key=key)
     how = {"signal": hybrid.reward, "moments": state.seen, "sampling": hybrid.sampling}
     for i, learner in enumerate(hybrid.learners):
         given = how | {"key": jax.random.fold_in(key, i)}
         after, report = learn(learner, state.learners[i], replay, updates, **given)
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}
-    state = replace(state, learners=tuple(learned), moments=state.seen)
     counted = {"frames": state.frames + frames, "episodes": state.episodes + episodes}
-    return replace(state, **counted), metrics
+    return replace(state, learners=tuple(learned), moments=state.seen, **counted), metrics
 
 
-def _paid(hybrid, state: HybridState, frames: Frames, *, key: Key):
+def _paid(hybrid, state: HybridState, frames: Frames, metrics: Metrics, *, key: Key):
     """What the redistribution knows with new `frames`, the buffer as it pays learners, and
-    metrics."""
+    `metrics` with its own."""
     given = (state.known, state.replay, state.seen, frames)
     fresh = jax.random.fold_in(key, len(hybrid.learners))
     known, replay, told = hybrid.redistribute.taught(*given, key=fresh)
-    return replace(state, known=known), replay, told
+    return replace(state, known=known), replay, metrics | told
 
 
 def inject(hybrid: Hybrid, state: HybridState, due: Bool[Array, ""]) -> HybridState:
     """If `due`, the learners' actors take the last slots: the offspring of the weakest parents."""
-    pairs = zip(hybrid.learners, state.learners, strict=True)
-    actors = [learner.actor(own) for learner, own in pairs]
+    actors = [one.actor(own) for one, own in zip(hybrid.learners, state.learners, strict=True)]
     population, lineage = _injected(state.population, state.lineage, actors, due)
     return replace(state, population=population, lineage=lineage)
 
@@ -319,8 +314,7 @@ def tested(hybrid: Hybrid, state: HybridState, fitness, metrics: Metrics, *, key
     """The champion on fresh episodes, every `test_every` generations. **Returns:** the state with
     the score of the last test, and all metrics of the generation."""
     due = (state.generation - 1) % hybrid.test_every == 0
-    given = (state.champion, hybrid.test_episodes, due, state.score)
-    score = retested(hybrid.env, *given, key=key)
+    score = retested(hybrid.env, state.champion, hybrid.test_episodes, due, state.score, key=key)
     metrics = {
         "fitness_max": jnp.max(rankable(fitness)),
         "fitness_mean": jnp.nanmean(fitness),
