@@ -83,7 +83,7 @@ def test_bytes_stay_bytes_and_are_numbers_for_a_learner():
     rows = jax.tree.map(lambda x: jnp.ones((2, *x.shape), x.dtype), row)
     replay = Replay.empty(row, 4).extend(rows, jnp.ones(2, bool))
     assert replay.data.obs.dtype == replay.data.next_obs.dtype == np.uint8
-    drawn = replay.sample(3, key=jax.random.key(0))
+    drawn, _ = replay.sample(3, key=jax.random.key(0))
     assert drawn.obs.dtype == np.uint8
     assert seen(None, drawn.obs).dtype == np.float32
     np.testing.assert_array_equal(seen(None, drawn.obs), 1.0)

@@ -42,19 +42,19 @@ class Sampling(eqx.Module):
 
     def draw(self, replay: "Replay", shape: tuple[int, ...], *, key: PRNGKeyArray) -> Array:
         """Numbers of rows of a buffer, with replacement."""
-        size = jnp.maximum(replay.size, 1)
         if self.half_life is None:
-            return jax.random.randint(key, shape, 0, size)
-        return _recent(replay, self.half_life, size, jax.random.uniform(key, shape))
+            return jax.random.randint(key, shape, 0, jnp.maximum(replay.size, 1))
+        return _recent(replay, self.half_life, jax.random.uniform(key, shape))
 
 
 UNIFORM = Sampling()
 Sampled = tuple[Transition, Any]  # and the discount behind each, or None
 
 
-def _recent(replay: "Replay", half_life: float, size: Array, u: Array) -> Array:
+def _recent(replay: "Replay", half_life: float, u: Array) -> Array:
     """Rows whose ages are exponentially distributed up to that of the oldest, by the inverse of
     their distribution function at `u`, uniform in [0, 1)."""
+    size = jnp.maximum(replay.size, 1)
     oldest = 1.0 - jnp.exp2(-size.astype(jnp.float32) / half_life)
     age = -half_life * jnp.log2(1.0 - u * oldest)
     age = jnp.minimum(age.astype(jnp.int32), size - 1)
@@ -112,8 +112,8 @@ class Replay(eqx.Module):
         Of a team all leaves get an axis of agents, `[n, agents, ...]`. Each agent has rows of its
         own, as from a buffer of its own, unless they are drawn `together`.
         """
-        team = self.data.action.shape[1:-1]
-        index = sampling.draw(self, (n,) if together else (n, *team), key=key)
+        team = () if together else self.data.action.shape[1:-1]
+        index = sampling.draw(self, (n, *team), key=key)
         rows = self._rows(index)
         return (rows, None) if sampling.steps == 1 else self._followed(rows, index, sampling, gamma)
 
@@ -131,9 +131,12 @@ class Replay(eqx.Module):
         return rows, discount
 
     def _rows(self, index: Int[Array, "n *agents"]) -> Transition:
+        if self.data.action.ndim > 2:
+            return self._of_team(index)
+        return jax.tree.map(lambda x: x[index], self.data)
+
+    def _of_team(self, index: Int[Array, "n *agents"]) -> Transition:
         """Each agent's part of its own row; what all share is repeated."""
-        if self.data.action.ndim == 2:
-            return jax.tree.map(lambda x: x[index], self.data)
         n, agents = len(index), self.data.action.shape[1]
         index = jnp.broadcast_to(index.reshape(n, -1), (n, agents))
         every = jnp.arange(agents)

@@ -428,7 +428,7 @@ def test_the_value_of_an_agent_that_ends_is_its_last_reward():
         rows = replay.sample(3, together=together, key=jax.random.key(0))[0]
         ends = (rows.terminated, rows.truncated, rows.active)
         batch = Batch(rows.obs, rows.action, rows.rewards["local"], rows.next_obs, *ends)
-        target = learner.bellman_target(state, batch, key=jax.random.key(0))
+        target = learner.bellman_target(state, batch, key=jax.random.key(0))[0]
         assert target[:, 0].tolist() == [1.0, 1.0, 1.0]
         assert (np.abs(np.asarray(target[:, 1])) > 0).all()
 

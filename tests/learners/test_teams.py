@@ -40,7 +40,7 @@ def update(learner, state, batch, key):
 
 @jit
 def bellman_target(learner, state, batch, key):
-    return learner.bellman_target(state, batch, key=key)
+    return learner.bellman_target(state, batch, key=key)[0]  # of means there is one sample
 
 
 def batch_of(seed, agents=AGENTS, active=True):

@@ -270,15 +270,14 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
     """Each learner makes `updates_per_frame` updates for each of some new `frames`, on minibatches
     of its own from the common buffer. The state counts these frames, and their `episodes`."""
     ready = (state.frames >= hybrid.warmup_frames) & bool(hybrid.learners)
-    updates = jnp.where(ready, frames.astype(jnp.float32) * hybrid.updates_per_frame, 0.0)
-    updates = updates.astype(jnp.int32)
-    learned, metrics, replay = [], {"updates": updates}, state.replay
+    due = jnp.where(ready, frames.astype(jnp.float32) * hybrid.updates_per_frame, 0.0)
+    learned, metrics, replay = [], {"updates": due.astype(jnp.int32)}, state.replay
     if hybrid.redistribute is not None and hybrid.learners:
         state, replay, metrics = _paid(hybrid, state, frames, metrics, key=key)
     how = {"signal": hybrid.reward, "moments": state.seen, "sampling": hybrid.sampling}
     for i, learner in enumerate(hybrid.learners):
         given = how | {"key": jax.random.fold_in(key, i)}
-        after, report = learn(learner, state.learners[i], replay, updates, **given)
+        after, report = learn(learner, state.learners[i], replay, metrics["updates"], **given)
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}
     counted = {"frames": state.frames + frames, "episodes": state.episodes + episodes}
@@ -296,7 +295,7 @@ def _paid(hybrid, state: HybridState, frames: Frames, metrics: Metrics, *, key: 
 
 def inject(hybrid: Hybrid, state: HybridState, due: Bool[Array, ""]) -> HybridState:
     """If `due`, the learners' actors take the last slots: the offspring of the weakest parents."""
-    actors = [one.actor(own) for one, own in zip(hybrid.learners, state.learners, strict=True)]
+    actors = [x.actor(own) for x, own in zip(hybrid.learners, state.learners, strict=True)]
     population, lineage = _injected(state.population, state.lineage, actors, due)
     return replace(state, population=population, lineage=lineage)
 
@@ -315,11 +314,10 @@ def tested(hybrid: Hybrid, state: HybridState, fitness, metrics: Metrics, *, key
     the score of the last test, and all metrics of the generation."""
     due = (state.generation - 1) % hybrid.test_every == 0
     score = retested(hybrid.env, state.champion, hybrid.test_episodes, due, state.score, key=key)
-    metrics = {
+    return replace(state, score=score), {
         "fitness_max": jnp.max(rankable(fitness)),
         "fitness_mean": jnp.nanmean(fitness),
         "fitness_nan": jnp.sum(jnp.isnan(fitness)),
         "champion_score": score,
         "episodes": state.episodes,
     } | metrics
-    return replace(state, score=score), metrics

@@ -94,6 +94,8 @@ class SAC(AbstractLearner):
     critic_lr: float = 3e-4  # learning rate of the critics' Adam, ≥ 0
     alpha_lr: float = 3e-4  # learning rate of the temperature's Adam, ≥ 0
     tau: float = 5e-3  # share of the new weights in the target networks per update, in [0, 1]
+    temperature: float = 1.0
+    """α before the first update, above 0: small where `reward_scale` makes returns of about 1."""
     target_entropy: float = -1.0  # of the policy, in nats per action dimension
     reward_scale: float | None = 1.0
     """Factor of all rewards that critics see, ≥ 0; None: as in TD3."""
@@ -109,6 +111,7 @@ class SAC(AbstractLearner):
             require.at_least(name, getattr(self, name), 0)
         for name in ("critics", "batch_size"):
             require.at_least(name, getattr(self, name), 1)
+        require.at_least("temperature", self.temperature, 1e-8)
 
     def init(self, network: AbstractNetwork, *sizes: int, key: PRNGKeyArray) -> SACState:
         if not (isinstance(network, MLP) and network.output_activation == "tanh"):
@@ -123,7 +126,7 @@ class SAC(AbstractLearner):
             self.critic.init(obs_size, action_size, key=key)
             for key in jax.random.split(critic_key, self.critics)
         )
-        log_alpha = jnp.float32(0.0)
+        log_alpha = jnp.log(jnp.float32(self.temperature))
         opts = (adam_state(actor), adam_state(critics), adam_state(log_alpha))
         return SACState(actor, critics, critics, log_alpha, *opts)
 

@@ -6,7 +6,6 @@ authors' first code. Time limits bootstrap; the author of ERL took them for the 
 The author clipped the gradient of DDPG's critic twice and of its actor never; both are clipped.
 """
 
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -135,9 +134,8 @@ class TD3(AbstractLearner):
         moving = (state.actor, state.actor_opt, state.target_actor, state.target_critics)
         due = state.step % self.policy_delay == 0
         moving = jax.lax.cond(due, moved, lambda: moving) if self.policy_delay > 1 else moved()
-        names = ("actor", "actor_opt", "target_actor", "target_critics")
-        after = dict(zip(names, moving, strict=True)) | {"step": state.step + 1}
-        state = replace(state, critics=critics, critic_opt=critic_opt, **after)
+        actor, opt, *targets = moving
+        state = TD3State(actor, critics, *targets, opt, critic_opt, state.step + 1, state.agents)
         return state, {"critic_loss": loss, "q": q}
 
     def bellman_target(self, state: TD3State, batch: Batch, *, key: Key) -> Returns:

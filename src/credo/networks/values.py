@@ -90,7 +90,7 @@ class Histogram(AbstractValues):
     least. Returns outside the bins count as their ends: let the learner scale its rewards."""
 
     atoms: int = eqx.field(static=True, default=101)  # bins, at least 2
-    limit: float = eqx.field(static=True, default=10.0)
+    limit: float = eqx.field(static=True, default=3.0)
     """Bins cover [-limit, limit], above 0, in units of scaled returns."""
     blur: float = eqx.field(static=True, default=0.75)
     """Standard deviation of the Gaussian, above 0, in bins."""

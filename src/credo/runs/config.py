@@ -128,7 +128,7 @@ def _untrusted(source: str, named: str) -> str:
     )
 
 
-_OWN = re.compile(r"credo\.(environments|networks|evolution|learners|algorithms)\.\w+:\w+")
+_OWN = re.compile(r"credo\.((environments|networks|evolution|learners|algorithms)\.\w+|replay):\w+")
 
 
 def class_names(tree: Any) -> Iterator[str]:
