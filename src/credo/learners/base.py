@@ -109,9 +109,9 @@ def _scaled(learner: Any, replay: Replay, signal: str) -> Any:
 def bellman(learner: AbstractLearner, batch: Batch, after: Returns, ended: Array) -> Returns:
     """Reward and discounted value of the next state: what returns are worth of which `after` is a
     sample there, unless the episode `ended`. `learn` puts a number where `reward_scale` is None."""
-    discount = learner.gamma if batch.discount is None else batch.discount
     reward: Any = learner.reward_scale * batch.reward  # pyright: ignore[reportOptionalOperand]
-    return reward + discount * jnp.where(ended, 0.0, after)
+    discount = learner.gamma if batch.discount is None else batch.discount[None]
+    return reward[None] + discount * jnp.where(ended[None], 0.0, after)
 
 
 def averaged(total: Metrics, count: Int[Array, ""]) -> Metrics:

@@ -128,14 +128,14 @@ class TD3(AbstractLearner):
         def moved():
             given, rate = (state.actor, critics[0], batch), (self.actor_lr, self.actor_max_norm)
             actor, opt, _ = descend(actor_loss, given, state.actor_opt, *rate)
-            targets = (state.target_actor, state.target_critics)
-            return actor, opt, *polyak(targets, (actor, critics), self.tau)
+            return actor, opt, polyak(before[2], (actor, critics), self.tau)
 
-        moving = (state.actor, state.actor_opt, state.target_actor, state.target_critics)
+        before = (state.actor, state.actor_opt, (state.target_actor, state.target_critics))
         due = state.step % self.policy_delay == 0
-        moving = jax.lax.cond(due, moved, lambda: moving) if self.policy_delay > 1 else moved()
-        actor, opt, *targets = moving
-        state = TD3State(actor, critics, *targets, opt, critic_opt, state.step + 1, state.agents)
+        after = jax.lax.cond(due, moved, lambda: before) if self.policy_delay > 1 else moved()
+        actor, opt, (target, targets) = after
+        counted = (state.step + 1, state.agents)
+        state = TD3State(actor, critics, target, targets, opt, critic_opt, *counted)
         return state, {"critic_loss": loss, "q": q}
 
     def bellman_target(self, state: TD3State, batch: Batch, *, key: Key) -> Returns:
