@@ -6,6 +6,7 @@ keeps the transitions. One policy is looked at: `record` keeps an episode of it,
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -33,21 +34,44 @@ class Experience(eqx.Module):
     transitions: Transition  # leaves [rows, ...]
     valid: Bool[Array, " rows"] | None  # None: every row, which then come from the host
 
-    def spread(self, played: Evaluation) -> "Experience":
-        """With every return of an episode, of whatever signal, paid in equal parts over its frames:
-        uniform redistribution (Gangwani et al. 2020; Ren et al. 2022, section 3)."""
-        steps = played.steps.reshape(-1)
+    def lived(self, played: Evaluation) -> Int[Any, " episodes"]:
+        """Rows of each episode: its steps; none of one that is lost."""
+        xp: Any = np if self.valid is None else jnp
+        returns = xp.asarray(next(iter(played.returns.values()))).reshape(played.steps.size, -1)
+        return xp.where(xp.isfinite(returns[:, 0]), played.steps.reshape(-1), 0)
+
+    def late(self, played: Evaluation, signal: str) -> Bool[Any, " episodes"]:
+        """Which episodes were paid nothing before their last step."""
+        rewards, lived = self.transitions.rewards[signal], self.lived(played)
+        paid = (rewards.reshape(len(rewards), math.prod(rewards.shape[1:])) != 0).any(axis=1)
+        if self.valid is None:  # the episodes, one behind the other, without the lost ones
+            paid[np.cumsum(lived)[lived > 0] - 1] = False
+            return np.bincount(np.repeat(np.arange(lived.size), lived), paid, lived.size) == 0
+        paid = paid.reshape(lived.size, -1)
+        return ~jnp.any(paid & (jnp.arange(paid.shape[1])[None] < lived[:, None] - 1), axis=1)
+
+    def spread(self, played: Evaluation, late_only: bool = False) -> "Experience":
+        """With every return of an episode, of whatever signal, paid in equal parts over its frames.
+
+        **Arguments:** `late_only`: of episodes that are paid before their last step, the rewards
+        stay as they are.
+        """
+        steps, lived = played.steps.reshape(-1), self.lived(played)
         length = jnp.maximum(steps, 1).astype(jnp.float32)[:, None]
         frames = max(self.transitions.terminated.shape[0] // steps.size, 1)
-        rewards = {}
+
+        def by_row(x: Any) -> Any:
+            if self.valid is None:
+                return np.repeat(np.asarray(x), lived, axis=0)
+            return jnp.repeat(x, frames, axis=0)
+
+        rewards, xp = {}, np if self.valid is None else jnp
         for name, returns in played.returns.items():
-            share = returns.reshape(steps.size, -1) / length
-            if self.valid is None:  # the episodes, one behind the other, without the lost ones
-                lived = np.where(np.isfinite(share[:, 0]), steps, 0)
-                rows = np.repeat(np.asarray(share), lived, axis=0)
-            else:
-                rows = jnp.repeat(share, frames, axis=0)
-            rewards[name] = rows.reshape(self.transitions.rewards[name].shape)
+            old = self.transitions.rewards[name]
+            rewards[name] = by_row(returns.reshape(steps.size, -1) / length).reshape(old.shape)
+            if late_only:
+                late = by_row(self.late(played, name)).reshape(-1, *(1,) * (old.ndim - 1))
+                rewards[name] = xp.where(late, rewards[name], old)
         return eqx.tree_at(lambda e: e.transitions.rewards, self, rewards)
 
     def last(self, played: Evaluation) -> Transition:

@@ -19,6 +19,7 @@ from credo.algorithms.off_policy import OffPolicy
 from credo.algorithms.ppo import PPO
 from credo.compilation import jit
 from credo.environments.probes import Copy, Meet
+from credo.learners.credit import Even
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3, matd3
 from credo.networks.exploration import GaussianNoise
@@ -292,7 +293,7 @@ def test_learners_on_different_levels_of_credit():
 
 
 def test_returns_may_be_spread_over_their_episodes(merl):
-    _, states = run(dataclasses.replace(ALGORITHM, redistribute=True, learners=(LEARNER,)), 2)
+    _, states = run(dataclasses.replace(ALGORITHM, redistribute=Even(), learners=(LEARNER,)), 2)
     data, written = states[-1].replay.data, int(states[-1].replay.written)
     kept = min(written, 150)
     rewards = {name: np.asarray(x)[:kept] for name, x in data.rewards.items()}

@@ -25,6 +25,7 @@ from credo.experiments import (
     runtime,
 )
 from credo.experiments.base import Trained, find
+from credo.learners.credit import Even
 from credo.learners.manager import UCB
 from credo.learners.sac import SAC
 from credo.learners.td3 import ddpg
@@ -131,7 +132,7 @@ def test_the_double_pendulum_is_played_both_ways():
         f"{label}, delayed" for label in standard
     ]
     task = DelayedHostReward(Gymnasium(name))
-    alone = OffPolicy.ddpg(task, test_episodes=100, redistribute=True)
+    alone = OffPolicy.ddpg(task, test_episodes=100, redistribute=Even())
     assert cells[spread].algorithm == alone
     assert cells[f"erl, {name}"].algorithm == ERL.erl(Gymnasium(name), test_episodes=100)
     hard = cells[f"ddpg, {name}, delayed"].algorithm

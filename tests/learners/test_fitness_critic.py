@@ -12,6 +12,7 @@ from credo.algorithms.ccea import BREEDER, CCEA, drafted
 from credo.algorithms.merl import MERL
 from credo.environments.probes import Meet
 from credo.environments.rover import Rover
+from credo.learners.credit import Even
 from credo.learners.fitness_critic import Criticised, FitnessCritic
 from credo.learners.td3 import TD3, TEAM
 from credo.networks.mlp import Critic
@@ -126,7 +127,7 @@ def test_merl_on_a_critic_trains():
         ROVERS,
         Team(trunk=(8,)),
         (Criticised(inner, TINY),),
-        redistribute=True,
+        redistribute=Even(),
         replay_capacity=500,
         test_episodes=2,
         **small,

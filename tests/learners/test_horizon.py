@@ -13,6 +13,7 @@ from credo.algorithms.erl import ERL
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy
 from credo.evolution.breeder import draw
+from credo.learners.credit import Even
 from credo.learners.horizon import Truncated
 from credo.learners.td3 import TD3
 from credo.networks.mlp import MLP, Critic
@@ -103,7 +104,7 @@ def test_the_population_plays_less_and_learners_play_on(played):
         (lambda: Truncated(0), "steps is 0"),
         (lambda: ERL.ea(Copy(), horizon=Truncated()), "there is no learner"),
         (
-            lambda: ERL.erl(Copy(), horizon=Truncated(), redistribute=True),
+            lambda: ERL.erl(Copy(), horizon=Truncated(), redistribute=Even()),
             "the first learner is paid a return in equal parts",
         ),
     ],

@@ -38,6 +38,7 @@ from ..evolution.breeder import AbstractBreeder, Breeder, evolving, overridden
 from ..evolution.mutation import MatrixMutation
 from ..learners.base import AbstractLearner
 from ..learners.coach import AbstractCoach
+from ..learners.credit import AbstractRedistribution, Even
 from ..learners.horizon import AbstractHorizon
 from ..learners.manager import UCB, AbstractManager
 from ..learners.share import AbstractShare
@@ -85,8 +86,8 @@ class ERL(Hybrid):
     remember: bool = eqx.field(static=True, default=False)
     """Rank a member by the average fitness over all generations that it lived through, not by the
     last one alone."""
-    redistribute: bool = eqx.field(static=True, default=False)
-    """Learners see each episode's return in equal parts over its frames, however late it came."""
+    redistribute: AbstractRedistribution | None = None
+    """How learners are paid an episode's return where it comes late; None: as the task pays."""
     workers: int = eqx.field(static=True, default=1)  # b: learners' episodes per generation, ≥ 1
     manager: AbstractManager | None = None  # allocates workers to learners; None: they go in turn
     share: AbstractShare | None = None
@@ -141,7 +142,7 @@ class ERL(Hybrid):
         critic = Critic(hidden=(128, 128))
         learner = TD3(critic=critic, gamma=0.999, reward_scale=0.01, **rates)
         settings = {"learners": (learner,), "elite_fraction": 0.4, "sync_period": 1}
-        settings |= {"remember": True, "redistribute": True, "updates_per_frame": 2.0}
+        settings |= {"remember": True, "redistribute": Even(), "updates_per_frame": 2.0}
         return cls.erl(env, network, **overridden(settings, overrides))
 
     @classmethod

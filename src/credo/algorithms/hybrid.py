@@ -21,6 +21,7 @@ from ..evolution.breeder import AbstractBreeder, draw
 from ..evolution.selection import rankable, ranking
 from ..learners.base import AbstractLearner, learn
 from ..learners.coach import AbstractCoach
+from ..learners.credit import AbstractRedistribution
 from ..learners.horizon import AbstractHorizon
 from ..learners.manager import UCB, AbstractManager, Ledger, even
 from ..learners.share import AbstractShare
@@ -54,6 +55,7 @@ class HybridState(eqx.Module):
     score: Float[Array, ""] = _field(-jnp.inf, jnp.float32)
     """Of the champion that was tested last; -inf: none was."""
     share: Float[Array, ""] = _field(0.0, jnp.float32)  # of the frames that the learners get
+    known: PyTree = None  # what a redistribution knows
     frames: Int[Array, ""] = _field(0, jnp.int32)
     episodes: Int[Array, ""] = _field(0, jnp.int32)
     generation: Int[Array, ""] = _field(0, jnp.int32)
@@ -76,7 +78,7 @@ class Hybrid(eqx.Module):
     coach: eqx.AbstractVar[AbstractCoach | None]
     surrogate: eqx.AbstractVar[AbstractSurrogate | None]
     horizon: eqx.AbstractVar[AbstractHorizon | None]
-    redistribute: eqx.AbstractVar[bool]
+    redistribute: eqx.AbstractVar[AbstractRedistribution | None]
     sampling: eqx.AbstractVar[Sampling]
     updates_per_frame: eqx.AbstractVar[float]
     warmup_frames: eqx.AbstractVar[int]
@@ -154,7 +156,13 @@ class Hybrid(eqx.Module):
             seen=moments,
             share=jnp.float32(self.share.first() if self.share else 0.0),
             breeding=breeding,
+            known=self.redistribute and self._known(key=jax.random.fold_in(key, 1 + q)),
         )
+
+    def _known(self, *, key: PRNGKeyArray) -> PyTree:
+        """What a redistribution knows at the start; None if there are no learners."""
+        how, given = self.redistribute, (self.env, self.rounds, self.replay_capacity)
+        return how.init(*given, key=key) if how is not None and self.learners else None
 
     def warm(self, state: HybridState, policy: AbstractPolicy) -> HybridState:
         """`state` that goes on from a saved policy: it becomes the first member and the actor of
@@ -187,18 +195,25 @@ def play(hybrid: Hybrid, state: HybridState, policies, episodes: int, **how) -> 
     All of a generation act by the moments of those before; learners learn by those with what was
     `seen` since.
     """
-    policies = behind(state.moments, policies)
-    played, experience = collect(hybrid.env, policies, episodes, **how)
-    return stored(hybrid, state, played, experience), played
+    played, new = collect(hybrid.env, behind(state.moments, policies), episodes, **how)
+    return stored(hybrid, state, played, new), played
 
 
 def stored(hybrid: Hybrid, state: HybridState, played: Evaluation, new: Experience) -> HybridState:
     """With what was met, in the replay buffer and in the moments."""
     state = replace(state, seen=watched(state.seen, new))
-    if state.replay is None:
-        return state
-    new = new.spread(played) if hybrid.redistribute else new
-    return replace(state, replay=extend(state.replay, new.transitions, new.valid))
+    if state.replay is not None and hybrid.redistribute is not None:
+        return _noted(hybrid.redistribute, state, new, played)
+    if state.replay is not None:
+        state = replace(state, replay=extend(state.replay, new.transitions, new.valid))
+    return state
+
+
+def _noted(how: AbstractRedistribution, state: HybridState, experience, played) -> HybridState:
+    """With a rollout in the replay buffer, and its episodes known to the redistribution."""
+    new = how.stored(experience, played)
+    replay = extend(state.replay, new.transitions, new.valid)
+    return replace(state, replay=replay, known=how.noted(state.known, replay, experience, played))
 
 
 def breed(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key) -> Result:
@@ -281,18 +296,28 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
     """Each learner makes `updates_per_frame` updates for each of some new `frames`, on minibatches
     of its own from the common buffer. The state counts these frames, and their `episodes`."""
     ready = (state.frames >= hybrid.warmup_frames) & bool(hybrid.learners)
-    updates = jnp.where(ready, frames.astype(jnp.float32) * hybrid.updates_per_frame, 0.0)
-    updates = updates.astype(jnp.int32)
-    learned, metrics = [], {"updates": updates}
+    due = jnp.where(ready, frames.astype(jnp.float32) * hybrid.updates_per_frame, 0.0)
+    learned, metrics, replay = [], {"updates": due.astype(jnp.int32)}, state.replay
+    if hybrid.redistribute is not None and hybrid.learners:
+        state, replay, metrics = _paid(hybrid, state, frames, metrics, key=key)
     how = {"signal": hybrid.reward, "moments": state.seen, "sampling": hybrid.sampling}
     for i, learner in enumerate(hybrid.learners):
         given = how | {"key": jax.random.fold_in(key, i)}
-        after, report = learn(learner, state.learners[i], state.replay, updates, **given)
+        after, report = learn(learner, state.learners[i], replay, metrics["updates"], **given)
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}
     counted = {"frames": state.frames + frames, "episodes": state.episodes + episodes}
     counted |= {"learned": state.learned | (updates > 0), "moments": state.seen}
     return replace(state, learners=tuple(learned), **counted), metrics
+
+
+def _paid(hybrid, state: HybridState, frames: Frames, metrics: Metrics, *, key: Key):
+    """What the redistribution knows with new `frames`, the buffer as it pays learners, and
+    `metrics` with its own."""
+    given = (state.known, state.replay, state.seen, frames)
+    fresh = jax.random.fold_in(key, len(hybrid.learners))
+    known, replay, told = hybrid.redistribute.taught(*given, key=fresh)
+    return replace(state, known=known), replay, metrics | told
 
 
 def inject(hybrid: Hybrid, state: HybridState, due: Bool[Array, ""]) -> HybridState:
@@ -315,13 +340,11 @@ def tested(hybrid: Hybrid, state: HybridState, fitness, metrics: Metrics, *, key
     """The champion on fresh episodes, every `test_every` generations. **Returns:** the state with
     the score of the last test, and all metrics of the generation."""
     due = (state.generation - 1) % hybrid.test_every == 0
-    given = (state.champion, hybrid.test_episodes, due, state.score)
-    score = retested(hybrid.env, *given, key=key)
-    metrics = {
+    score = retested(hybrid.env, state.champion, hybrid.test_episodes, due, state.score, key=key)
+    return replace(state, score=score), {
         "fitness_max": jnp.max(rankable(fitness)),
         "fitness_mean": jnp.nanmean(fitness),
         "fitness_nan": jnp.sum(jnp.isnan(fitness)),
         "champion_score": score,
         "episodes": state.episodes,
     } | metrics
-    return replace(state, score=score), metrics

@@ -37,6 +37,7 @@ from ..compilation import float32
 from ..evolution.breeder import AbstractBreeder, evolving
 from ..learners.base import AbstractLearner
 from ..learners.coach import AbstractCoach
+from ..learners.credit import AbstractRedistribution
 from ..learners.horizon import AbstractHorizon
 from ..learners.share import AbstractShare
 from ..learners.surrogate import AbstractSurrogate
@@ -88,8 +89,8 @@ class MERL(Hybrid):
     test_every: int = eqx.field(static=True, default=1)  # generations from test to test, ≥ 1
     fitness: str | None = eqx.field(static=True, default=None)
     """Name of the reward that fitness sums up; None: the task\'s first."""
-    redistribute: bool = eqx.field(static=True, default=False)
-    """Learners see each episode's return in equal parts over its frames, however late it came."""
+    redistribute: AbstractRedistribution | None = None
+    """How learners are paid an episode's return where it comes late; None: as the task pays."""
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Policies see observations normalised by the running mean and variance of all observations so
     far; the champion keeps them."""

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from .. import require, tree
 from ..compilation import float32
 from ..learners.base import AbstractLearner, learn
+from ..learners.credit import AbstractRedistribution
 from ..learners.sac import SAC
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, TEAM, ddpg, maddpg, matd3
 from ..networks.base import AbstractNetwork, AbstractPolicy
@@ -37,6 +38,7 @@ class OffPolicyState(eqx.Module):
     score: Float[Array, ""]  # of its last test; -inf: none
     frames: Int[Array, ""]
     moments: Moments | None  # of all observations; None: they are not normalised
+    known: PyTree = None  # what a redistribution knows
 
 
 class OffPolicy(eqx.Module):
@@ -51,8 +53,8 @@ class OffPolicy(eqx.Module):
     start_frames: int = eqx.field(static=True, default=25_000)  # frames of random actions, ≥ 0
     updates_per_frame: float = 1.0  # gradient updates per environment frame, at least 0
     sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
-    redistribute: bool = eqx.field(static=True, default=False)
-    """The learner sees each episode's return in equal parts over its frames."""
+    redistribute: AbstractRedistribution | None = None
+    """How the learner is paid an episode's return where it comes late; None: as the task pays."""
     test_episodes: int = eqx.field(static=True, default=10)  # episodes of an actor's test, ≥ 1
     test_every: int = eqx.field(static=True, default=5_000)  # frames between tests, at least 1
     replay_capacity: int = eqx.field(
@@ -127,7 +129,14 @@ class OffPolicy(eqx.Module):
             score=jnp.float32(-jnp.inf),
             frames=jnp.int32(0),
             moments=moments,
+            known=self._known(key=jax.random.fold_in(key, 1)),
         )
+
+    def _known(self, *, key: PRNGKeyArray) -> PyTree:
+        """What a redistribution knows at the start."""
+        if self.redistribute is None:
+            return None
+        return self.redistribute.init(self.env, self.episodes, self.replay_capacity, key=key)
 
     def warm(self, state: OffPolicyState, policy: AbstractPolicy) -> OffPolicyState:
         """`state` that goes on from a saved policy of the same network, without random actions. Its
@@ -150,8 +159,9 @@ class OffPolicy(eqx.Module):
         explorer = behind(state.moments, explorer)
         played, experience = collect(self.env, explorer, self.episodes, **how)
         moments = watched(state.moments, experience)
-        experience = experience.spread(played) if self.redistribute else experience
-        replay = extend(state.replay, experience.transitions, experience.valid)
+        replay, known, how = state.replay, state.known, self.redistribute
+        rows = experience if how is None else how.stored(experience, played)
+        replay = paid = extend(replay, rows.transitions, rows.valid)
         new = jnp.sum(played.steps)
         frames = state.frames + new
 
@@ -163,9 +173,13 @@ class OffPolicy(eqx.Module):
         updates = jnp.where(frames > self.start_frames, total - before, 0.0).astype(jnp.int32)
         reward = objective(self.env, self.learner.signal)
         given = {"signal": reward, "moments": moments, "sampling": self.sampling}
-        learner, metrics = learn(
-            self.learner, state.learner, replay, updates, **given, key=learn_key
-        )
+        told: Metrics = {}
+        if how is not None:
+            known = how.noted(known, replay, experience, played)
+            fresh = jax.random.fold_in(key, 3)
+            known, paid, told = how.taught(known, replay, moments, new, key=fresh)
+        learner, metrics = learn(self.learner, state.learner, paid, updates, **given, key=learn_key)
+        metrics |= told
 
         # Test the actor without noise, now and then.
         actor = frozen(moments, self.learner.actor(learner))
@@ -181,4 +195,5 @@ class OffPolicy(eqx.Module):
             "updates": updates,
         }
         state = replace(state, learner=learner, replay=replay, champion=actor)
-        return replace(state, score=score, frames=frames, moments=moments), metrics
+        state = replace(state, score=score, frames=frames, moments=moments, known=known)
+        return state, metrics

@@ -42,7 +42,7 @@ class Changed(AbstractPolicy):
 
     team: AbstractPolicy
     other: AbstractPolicy
-    agent: Int[Array, ""]  # who is changed; -1: nobody
+    agent: Int[Array, ""]  # who is changed; -1: none
 
     def start(self, *, key: PRNGKeyArray) -> PyTree:
         return self.team.start(key=key), self.other.start(key=key)
@@ -108,7 +108,7 @@ def _direction(change: np.ndarray, returns: np.ndarray) -> np.ndarray:
 
 
 def _fresh(env: AbstractEnvironment, key: PRNGKeyArray) -> PyTree:
-    """Teams of networks that nobody trained, each agent its own."""
+    """Teams of untrained networks, each agent its own."""
     network, keys = Team(sharing="nothing"), jax.random.split(key, TEAMS)
     return eqx.filter_vmap(lambda key: network.init(*env.sizes, key=key))(keys)
 

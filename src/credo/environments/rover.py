@@ -212,7 +212,7 @@ class Rover(AbstractEnvironment):
     def misleading(cls, coupling: int = 3, mislead: float = 0.5, **overrides) -> "Rover":
         """Four decoys near the start, worth a fifth of all, which one rover observes, and four POIs
         farther away that need `coupling`. The local reward pays a rover to stay beside a decoy that
-        nobody observes, the more the greater `mislead` is. `overrides`: fields."""
+        is not observed, the more the greater `mislead` is. `overrides`: fields."""
         preset = {
             "pois": 8,
             "decoys": 4,

@@ -2,7 +2,7 @@
 
 beyond-7-decoys: near the rovers lie decoys, POIs of low value that one rover observes; farther away
 lie POIs of high value that need `coupling` rovers. A share of the local reward, the dial, pays a
-rover to stay beside a decoy that nobody observes; the rest pays for coming closer to the others.
+rover to stay beside a decoy that is not observed yet; the rest pays for coming closer to the others.
 The learner alone, in four forms, evolution alone, and MERL, at equal frames and updates.
 
 beyond-7-critics: 15 rovers, four POIs worth 1, 2, 3 and 4 that need four rovers each, paid by the
@@ -19,6 +19,7 @@ from ..algorithms.ccea import CCEA
 from ..algorithms.merl import LOCAL, MERL
 from ..analysis.factoredness import factoredness
 from ..environments.rover import Rover
+from ..learners.credit import Even
 from ..learners.fitness_critic import Criticised, FitnessCritic
 from ..networks.mlp import MLP
 from ..networks.team import Team
@@ -51,7 +52,7 @@ def decoys(budget: str) -> list[Cell]:
 
 
 def agreement(env: Rover) -> dict[str, float]:
-    """How often the local reward agrees with the global one, of teams that nobody trained."""
+    """How often the local reward agrees with the global one, of untrained teams."""
     return {FACTORED: round(factoredness(env)["local"].share, 3)}
 
 
@@ -88,11 +89,11 @@ RETURN = dataclasses.replace(LOCAL, signal="global", reward_scale=50.0)
 UNSHAPED: dict[str, dict[str, Any]] = {
     "ea, one policy for all": {"learners": (), "network": ALIKE},
     "ea": {"learners": ()},
-    "merl, return spread": {"learners": (RETURN,), "network": ALIKE, "redistribute": True},
+    "merl, return spread": {"learners": (RETURN,), "network": ALIKE, "redistribute": Even()},
     "merl, fitness critic": {
         "learners": (Criticised(RETURN),),  # pyright: ignore[reportCallIssue]
         "network": ALIKE,
-        "redistribute": True,
+        "redistribute": Even(),
     },
 }
 

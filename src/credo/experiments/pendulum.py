@@ -17,6 +17,7 @@ import numpy as np
 
 from ..algorithms.erl import ERL
 from ..algorithms.off_policy import OffPolicy
+from ..learners.credit import Even
 from ..report.rows import Results, Row
 from . import measures
 from .base import Cell, Experiment, Trained, Value
@@ -32,7 +33,7 @@ METHODS: dict[str, tuple[str, Any]] = {  # whose limits it has, and how it is bu
     "erl": ("erl", ERL.erl),
     "erl ours": ("erl", ERL.ours),
     "ddpg": ("ddpg", OffPolicy.ddpg),
-    "ddpg spread": ("ddpg", partial(OffPolicy.ddpg, redistribute=True)),
+    "ddpg spread": ("ddpg", partial(OffPolicy.ddpg, redistribute=Even())),
     "ea": ("ea", partial(ERL.ea, test_every=10)),
 }
 # An episode is a few steps long until the task is nearly solved: episodes end most runs, frames

@@ -138,8 +138,8 @@ class Criticised(AbstractLearner):
     """A learner whose reward is what a fitness critic says of the place that a step leads to.
 
     The critic is fitted to the rewards in the buffer, of the same minibatches: let the algorithm
-    have `redistribute`, so that each frame has its part of the whole episode's return. No reward
-    that somebody made for single agents is needed.
+    have `redistribute=Even()`, so that each frame has its part of the whole episode's return. No
+    reward designed for single agents is needed.
     """
 
     metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "q", "fitness_critic_loss")

@@ -20,6 +20,7 @@ import equinox as eqx
 
 from .. import require
 from .base import AbstractLearner, require_critic
+from .credit import AbstractRedistribution
 
 
 class AbstractHorizon(eqx.Module):
@@ -27,13 +28,18 @@ class AbstractHorizon(eqx.Module):
 
     steps: eqx.AbstractVar[int]  # most steps of an episode of the population, at least 1
 
-    def check(self, reward: str, spread: bool, learners: tuple[AbstractLearner, ...]) -> None:
+    def check(
+        self,
+        reward: str,
+        credit: AbstractRedistribution | None,
+        learners: tuple[AbstractLearner, ...],
+    ) -> None:
         """Raise unless the first learner has a critic, and one of the reward that is the fitness,
         frame by frame."""
         require_critic(self, learners)
         signal = learners[0].signal or reward
-        if signal != reward or spread:
-            paid = "a return in equal parts" if spread else f"{signal!r}"
+        if signal != reward or credit is not None:
+            paid = "by a redistribution" if credit else f"{signal!r}"
             raise ValueError(
                 f"{type(self).__name__} adds the critic's value to a return of {reward!r}, and the "
                 f"first learner is paid {paid}: put a learner of {reward!r} first, without "

@@ -35,6 +35,7 @@ from ..evolution.mutation import AbstractMutation
 from ..evolution.selection import AbstractSelection
 from ..learners.base import AbstractLearner
 from ..learners.coach import AbstractCoach
+from ..learners.credit import AbstractRedistribution
 from ..learners.horizon import AbstractHorizon
 from ..learners.manager import AbstractManager
 from ..learners.share import AbstractShare
@@ -62,6 +63,7 @@ EXTENSIONS = (
     AbstractCoach,
     AbstractSurrogate,
     AbstractHorizon,
+    AbstractRedistribution,
 )
 PACKAGES = ("credo", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
 
@@ -102,6 +104,7 @@ def from_tree(tree: Any, *, trust: bool = True, source: str = "this record") -> 
 
     **Raises:** `ConfigError`, or what a class says about the values it is given.
     """
+    tree = _renewed(tree)
     foreign = [] if trust else [name for name in class_names(tree) if not _OWN.fullmatch(name)]
     if foreign:
         raise ConfigError(_untrusted(source, foreign[0]))
@@ -267,7 +270,23 @@ def changed(recorded: Any, today: Any) -> list[str]:
     """Where the tree of an object that was recorded differs from today's tree of one. A field that
     came after the record has its default. Nothing that only the record names is imported or made.
     Raises `ConfigError` if a class has no such field today."""
+    recorded = _renewed(recorded)
     return [] if recorded == today else differences(_completed(recorded, today), today)
+
+
+EVEN = {"class": "credo.learners.credit:Even", "late_only": False}
+
+
+def _renewed(tree: Any) -> Any:
+    """A record as it would be written today: `redistribute` was True or False once."""
+    if isinstance(tree, list):
+        return [_renewed(part) for part in tree]
+    if not isinstance(tree, dict):
+        return tree
+    new = {name: _renewed(part) for name, part in tree.items()}
+    if isinstance(new.get("redistribute"), bool):
+        new["redistribute"] = dict(EVEN) if new["redistribute"] else None
+    return new
 
 
 def _completed(recorded: Any, today: Any) -> Any:
