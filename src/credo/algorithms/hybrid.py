@@ -307,7 +307,7 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}
     counted = {"frames": state.frames + frames, "episodes": state.episodes + episodes}
-    counted |= {"learned": state.learned | (updates > 0), "moments": state.seen}
+    counted |= {"learned": state.learned | (metrics["updates"] > 0), "moments": state.seen}
     return replace(state, learners=tuple(learned), **counted), metrics
 
 

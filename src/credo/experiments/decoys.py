@@ -2,7 +2,7 @@
 
 beyond-7-decoys: near the rovers lie decoys, POIs of low value that one rover observes; farther away
 lie POIs of high value that need `coupling` rovers. A share of the local reward, the dial, pays a
-rover to stay beside a decoy that is not observed yet; the rest pays for coming closer to the others.
+rover to stay beside a decoy that is not observed yet; the rest pays for coming closer to others.
 The learner alone, in four forms, evolution alone, and MERL, at equal frames and updates.
 
 beyond-7-critics: 15 rovers, four POIs worth 1, 2, 3 and 4 that need four rovers each, paid by the
