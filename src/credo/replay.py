@@ -163,8 +163,11 @@ def shapes_alone() -> Iterator[None]:
 def extend(replay: Replay, rows: Transition, valid: Array | None = None) -> Replay:
     """`Replay.extend` for rows from anywhere; `replay` is donated. Rows from the host, all of them
     valid, go in blocks, so that their number is data."""
-    if valid is not None:
-        return _extend((rows, valid), replay)
+    return _extended(replay, rows) if valid is None else _extend((rows, valid), replay)
+
+
+def _extended(replay: Replay, rows: Transition) -> Replay:
+    """With rows from the host, block by block."""
     n = rows.terminated.shape[0]
     blocks = range(0, n, BLOCK)
     padded = jax.tree.map(lambda x: np.resize(x, (len(blocks) * BLOCK, *x.shape[1:])), rows)

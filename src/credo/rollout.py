@@ -254,9 +254,7 @@ def _play(
         keys = _each(lambda key: jax.random.fold_in(key, t))(step_keys)
         bounded = jnp.clip(actions, -1.0, 1.0)
         states, step = _each(lambda s, a, key: env.step(s, a, key=key))(states, bounded, keys)
-        if limit is not None:
-            over = step.truncated | ((t + 1 >= limit) & ~step.terminated)
-            step = dataclasses.replace(step, truncated=over)
+        step = step if limit is None else step.cut(t + 1 >= limit)
         for x in jax.tree.leaves((step.obs, step.rewards)):
             sound = sound & _sound(x)
         lost = lost | (active & ~sound)

@@ -113,9 +113,12 @@ def in_batches(function: Callable[[PyTree], PyTree], members: PyTree) -> PyTree:
     Large genomes would go through memory once per operation; and XLA would merge what is done to
     all of them into few programs that take minutes to compile.
     """
+    return function(members) if batch(members) == size(members) else _in_turn(function, members)
+
+
+def _in_turn(function: Callable[[PyTree], PyTree], members: PyTree) -> PyTree:
+    """`function` of one batch after the other."""
     n, some = size(members), batch(members)
-    if some == n:
-        return function(members)
     if n % some:  # the last one again fills the last batch
         members = take(members, jnp.minimum(jnp.arange(math.ceil(n / some) * some), n - 1))
     arrays, rest = eqx.partition(members, eqx.is_array)

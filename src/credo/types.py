@@ -1,5 +1,6 @@
 """The records that cross module borders. Every one is a pytree."""
 
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -34,6 +35,10 @@ class TimeStep(eqx.Module):
         """For whom the task ended: do not bootstrap. Of each agent, where `gone` tells them
         apart."""
         return self.terminated if self.gone is None else self.terminated[..., None] | self.gone
+
+    def cut(self, over: Bool[Array, ""]) -> "TimeStep":
+        """Truncated here if it is `over`, unless the task ended just now."""
+        return replace(self, truncated=self.truncated | (over & ~self.terminated))
 
 
 class Sequence(eqx.Module):

@@ -28,9 +28,8 @@ class Ledger(eqx.Module):
 
     @classmethod
     def empty(cls, q: int) -> "Ledger":
-        return cls(
-            jnp.zeros(q), jnp.zeros(q), jnp.zeros(q, jnp.int32), jnp.zeros(q, bool), jnp.zeros(q)
-        )
+        none = jnp.zeros(q)
+        return cls(none, none, none.astype(jnp.int32), none.astype(bool), none)
 
     @property
     def comparable(self) -> Float[Array, " q"]:

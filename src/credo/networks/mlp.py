@@ -154,8 +154,7 @@ class Critic(AbstractCritic):
         sizes = (inputs, *self.hidden, self.values.atoms)
         weights |= draw_layers(sizes, self.initializer, self.normalization, key=layers_key)
         weights = scaled(weights, len(self.hidden), self.output_scale)
-        made = {"config": self, "values": self.values, "action_size": action_size}
-        return CriticNetwork(weights=weights, **made)
+        return CriticNetwork(weights, self, self.values, action_size)
 
 
 class CriticNetwork(AbstractCriticNetwork):
@@ -169,10 +168,8 @@ class CriticNetwork(AbstractCriticNetwork):
     def atoms(self, obs, action):
         c = self.config
         if c.branches:
-            φ = ACTIVATIONS[c.activation]
-            obs, action = (
-                φ(linear(self.weights, name, x)) for name, x in (("S", obs), ("A", action))
-            )
+            obs, action = (linear(self.weights, *x) for x in (("S", obs), ("A", action)))
+            obs, action = map(ACTIVATIONS[c.activation], (obs, action))
         x = jnp.concatenate([obs, action])
         x = hidden_layers(self.weights, x, len(c.hidden), c.activation, c.normalization)
         return linear(self.weights, len(c.hidden), x)
@@ -220,14 +217,13 @@ def draw_layers(
 ) -> dict[str, Float[Array, "..."]]:
     """Fresh layers between these sizes; LayerNorms start at gain 1 and shift 0."""
     shapes: dict[str, tuple[int, ...]] = {}
-    bounds: dict[str, float] = {}
     for layer, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
         shapes |= {f"W_{layer}": (fan_out, fan_in), f"b_{layer}": (fan_out,)}
-        bounds |= {f"W_{layer}": fan_in**-0.5, f"b_{layer}": fan_in**-0.5}
     weights = draw(shapes, "normal" if initializer == "uniform" else initializer, key=key)
     if initializer == "uniform":
         # The distribution function of a Gaussian draw is uniform.
-        weights = {k: bounds[k] * (2.0 * norm.cdf(w) - 1.0) for k, w in weights.items()}
+        bound = {f"{kind}_{i}": n**-0.5 for i, n in enumerate(sizes[:-1]) for kind in "Wb"}
+        weights = {k: bound[k] * (2.0 * norm.cdf(w) - 1.0) for k, w in weights.items()}
     if normalization != "none":
         for layer, units in enumerate(sizes[1:-1]):
             weights |= {f"g_{layer}": jnp.ones(units), f"s_{layer}": jnp.zeros(units)}
