@@ -15,10 +15,12 @@ from credo import rollout, tree
 from credo.algorithms.erl import BREEDER, ERL, TABLE_5_1
 from credo.algorithms.hybrid import bred as breed
 from credo.algorithms.lineage import CROSSED, DRAWN, INJECTED, MUTATED, Lineage
+from credo.algorithms.off_policy import OffPolicy
 from credo.compilation import jit
 from credo.environments.gymnasium import Gymnasium
-from credo.environments.probes import Copy
+from credo.environments.probes import Copy, Meet
 from credo.evolution.crossover import MaskedCrossover
+from credo.learners.credit import Even
 from credo.learners.manager import UCB
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3
@@ -499,7 +501,7 @@ def test_erl_has_its_tasks_column_of_table_5_1(task):
 
 def test_presets_and_what_they_share():
     presets = {name: make(Copy()) for name, make in ERL.presets().items()}
-    assert set(presets) == {"erl", "ours", "ea", "cerl"}
+    assert set(presets) == {"erl", "ours", "hybrid", "ea", "cerl"}
     erl, ea, cerl = presets["erl"], presets["ea"], presets["cerl"]
     assert dataclasses.replace(erl, learners=()) == ea
     assert (erl.breeder.elite_fraction, erl.episodes, erl.sync_period) == (0.1, 1, 10)
@@ -512,6 +514,18 @@ def test_presets_and_what_they_share():
     assert (cerl.workers, cerl.manager, cerl.elites) == (10, UCB(), 2)
     assert (cerl.sync_period, cerl.test_episodes, cerl.replay_capacity) == (5, 10, 1_000_000)
     assert ERL.cerl(Copy(), workers=3).workers == 3
+
+
+def test_the_hybrid_and_its_learner_alone_differ_in_nothing_else():
+    hybrid, alone = ERL.hybrid(Copy()), OffPolicy.hybrid(Copy())
+    assert (alone.learner,) == hybrid.learners
+    for name in ("network", "redistribute", "normalize_observations", "sampling"):
+        assert getattr(alone, name) == getattr(hybrid, name)
+    assert alone.updates_per_frame == hybrid.updates_per_frame == 1.0
+    assert hybrid.redistribute == Even(late_only=True)  # dense rewards stay as they are
+    assert ERL.hybrid(Copy(), elite_fraction=0.3).breeder.elite_fraction == 0.3
+    with pytest.raises(ValueError, match="train a team by merl"):
+        ERL.hybrid(Meet())
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import scipy.stats
 
 from credo.analysis.statistics import (
     bootstrap_interval,
+    improvement_interval,
     interquartile_mean,
     mean_and_standard_error,
     moving_average,
@@ -181,3 +182,14 @@ def test_moving_average_forgets_a_missing_value():
 def test_errors_say_what_is_allowed(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_the_interval_of_an_improvement_holds_the_probability():
+    assert improvement_interval([4.0, 5.0], [1.0, 2.0]) == (1.0, 1.0)
+    assert improvement_interval([1.0, 1.0], [1.0, 1.0]) == (0.5, 0.5)
+    assert np.isnan(improvement_interval([4.0], [1.0, 2.0])).all()
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(0.5, 1.0, 40), rng.normal(0.0, 1.0, 40)
+    low, high = improvement_interval(x, y)
+    assert low < probability_of_improvement(x, y) < high
+    assert low == pytest.approx(probability_of_improvement(x, y) - 1.96 * 0.062, abs=0.03)

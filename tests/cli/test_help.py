@@ -34,7 +34,7 @@ def test_every_field_is_listed_by_the_object_that_it_is_of(capsys):
         assert f"\n{title}\n" in out
     for flag in ("--learners.2.gamma", "--manager", "--gamma", "--checkpoint-every", "--learners"):
         assert f"\n  {flag} " in out
-    assert "(ucb, uniform, thompson, none) [ucb]" in " ".join(out.split())
+    assert "(ucb, uniform, thompson, progress, none) [ucb]" in " ".join(out.split())
 
 
 def test_a_short_name_shows_the_defaults_of_all_its_fields(capsys):

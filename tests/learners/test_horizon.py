@@ -105,7 +105,7 @@ def test_the_population_plays_less_and_learners_play_on(played):
         (lambda: ERL.ea(Copy(), horizon=Truncated()), "there is no learner"),
         (
             lambda: ERL.erl(Copy(), horizon=Truncated(), redistribute=Even()),
-            "the first learner is paid a return in equal parts",
+            "the first learner is paid by a redistribution",
         ),
     ],
 )

@@ -140,7 +140,8 @@ def test_the_page_holds_the_episodes_bit_for_bit(tmp_path, traces, episodes):
     assert "<h1>A &lt;b&gt;</h1>" in html
     data = embedded(html)
     task = data["task"]
-    assert (task["size"], task["activation_distance"], task["coupling"]) == (8, 3, 2)
+    assert (task["size"], task["activation_distance"]) == (8, 3)
+    assert task["needed"] == [2, 2]
     assert [e["name"] for e in data["episodes"]] == ["seed 3", "seed 4", "seed 5"]
     for shown, episode in zip(data["episodes"], episodes, strict=True):
         for name in SHOWN:

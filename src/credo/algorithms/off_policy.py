@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from .. import require, tree
 from ..compilation import float32
 from ..learners.base import AbstractLearner, learn
-from ..learners.credit import AbstractRedistribution
-from ..learners.sac import SAC
+from ..learners.credit import AbstractRedistribution, Even
+from ..learners.sac import HYBRID_NETWORK, SAC, modern
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, TEAM, ddpg, maddpg, matd3
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.team import Team
@@ -93,6 +93,14 @@ class OffPolicy(eqx.Module):
         return cls(env, network or TD3_NETWORK, **settings | overrides)
 
     @classmethod
+    def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """The learner of `ERL.hybrid` alone: the same network, and what it sees of observations and
+        rewards."""
+        settings: dict[str, Any] = {"learner": modern(), "start_frames": 5_000}
+        settings |= {"normalize_observations": True, "redistribute": Even(late_only=True)}
+        return cls(env, network or HYBRID_NETWORK, **settings | overrides)
+
+    @classmethod
     def matd3(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """A team, in ten worlds at a time, with the team's constants of MERL."""
         settings = {"learner": matd3(), "episodes": 10, "start_frames": 5_000}
@@ -107,7 +115,7 @@ class OffPolicy(eqx.Module):
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
         """Settings by name, for the command line."""
-        names = ("td3", "ddpg", "sac", "matd3", "maddpg")
+        names = ("td3", "ddpg", "sac", "matd3", "maddpg", "hybrid")
         return {name: getattr(cls, name) for name in names}
 
     @property

@@ -135,6 +135,21 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
     return float(wins + 0.5 * ties)
 
 
+def improvement_interval(
+    x: ArrayLike, y: ArrayLike, confidence: float = 0.95, resamples: int = 10_000, seed: int = 0
+) -> tuple[float, float]:
+    """Percentile bootstrap interval (low, high) of `probability_of_improvement` on one task, over
+    the runs of `x[runs_x]` and `y[runs_y]`, each drawn with replacement; NaN if either has one."""
+    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    if min(len(x), len(y)) < 2:
+        return float("nan"), float("nan")
+    rng, better = np.random.default_rng(seed), np.sign(x[:, None] - y[None]) / 2 + 0.5
+    rows, columns = (rng.integers(n, size=(resamples, n)) for n in better.shape)
+    drawn = better[rows[:, :, None], columns[:, None]].mean(axis=(1, 2))
+    low, high = np.quantile(drawn, [0.5 - confidence / 2, 0.5 + confidence / 2])
+    return float(low), float(high)
+
+
 def success_rate(x: ArrayLike, threshold: float) -> Floats:
     """Share of the runs of `x[runs, ...]` that score `threshold` or more, in [0, 1]."""
     return (over_runs(x) >= threshold).mean(axis=0)

@@ -45,6 +45,8 @@ EXPERIMENTS = {
     "beyond-7": "difference rewards, levels of credit, memory, sharing",
     "beyond-7-decoys": "decoys: a local reward that misleads, by a dial",
     "beyond-7-critics": "15 rovers from the team's reward alone, fitness critics",
+    "hybrid-dense": "when does a hybrid win? Rewards at every step",
+    "hybrid-late": "when does a hybrid win? The return at the last step",
     "check-spread": "MADDPG and MATD3 on simple_spread",
 }
 
@@ -66,6 +68,7 @@ MODULES = {  # of this folder, with the experiments that each has
     "rovers": ("fig-7.1", "fig-7.4", "beyond-7"),
     "decoys": ("beyond-7-decoys", "beyond-7-critics"),
     "paths": ("fig-7.5",),
+    "hybrids": ("hybrid-dense", "hybrid-late"),
     "check_spread": ("check-spread",),
 }
 

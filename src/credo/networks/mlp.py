@@ -154,7 +154,8 @@ class Critic(AbstractCritic):
         sizes = (inputs, *self.hidden, self.values.atoms)
         weights |= draw_layers(sizes, self.initializer, self.normalization, key=layers_key)
         weights = scaled(weights, len(self.hidden), self.output_scale)
-        return CriticNetwork(weights, self, self.values, action_size)
+        made = {"config": self, "values": self.values, "action_size": action_size}
+        return CriticNetwork(weights=weights, **made)
 
 
 class CriticNetwork(AbstractCriticNetwork):

@@ -1,0 +1,22 @@
+"""When does a hybrid win: the table that says it."""
+
+from credo.experiments.hybrids import EVOLUTION, HYBRID, IMPROVEMENT, LEARNER, improvement
+from credo.report.rows import Results, Row
+
+
+def test_the_hybrid_stands_beside_each_of_its_parts():
+    scores = {HYBRID: (30.0, 50.0), LEARNER: (20.0, 40.0), EVOLUTION: (-1.0, -3.0)}
+    rows = [
+        Row({"method": method, "task": "Hopper-v5", "episode": episode}, seed, "return", value)
+        for method, runs in scores.items()
+        for seed, value in enumerate(runs)
+        for episode in (0, 1)
+    ]
+    (table,) = improvement(Results("", "", "", [], rows, []), ())
+    assert table.columns == list(IMPROVEMENT)
+    learner, evolution = table.rows
+    # 30 > 20, 30 < 40, 50 > both: three of four pairs; the ratio of 40 to 30.
+    assert learner[:4] == ["Hopper-v5", LEARNER, "1.33", "0.75"]
+    assert learner[4] == "0.00 to 1.00"
+    # A ratio to a negative mean says nothing.
+    assert evolution == ["Hopper-v5", EVOLUTION, None, "1.00", "1.00 to 1.00"]
