@@ -150,12 +150,12 @@ class ERL(Hybrid):
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """One preset for dense and late rewards: policies that mutation moves, beside a learner of
         this decade that earns its frames, joins every generation, and sees late returns spread.
-        Chosen on seeds from 1000 on; docs, hybrids, say by what."""
+        Chosen on seeds from 1000 on; docs, hybrid, say by what."""
         if env.agents is not None:
             raise ValueError("hybrid is for one agent: train a team by merl, or MERL.merl(env)")
-        settings: dict[str, Any] = {"learners": (modern(),), "share": Earned(0.3, 0.9, 0.5)}
+        settings: dict[str, Any] = {"learners": (modern(),), "share": Earned(0.5, 0.9)}
         settings |= {"elite_fraction": 0.2, "sync_period": 1, "redistribute": Even(late_only=True)}
-        settings |= {"normalize_observations": True, "warmup_frames": 5_000}
+        settings |= {"warmup_frames": 5_000}
         return cls(env, network or HYBRID_NETWORK, **evolving(BREEDER, settings, overrides))
 
     @classmethod

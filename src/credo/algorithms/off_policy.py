@@ -94,10 +94,9 @@ class OffPolicy(eqx.Module):
 
     @classmethod
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """The learner of `ERL.hybrid` alone: the same network, and what it sees of observations and
-        rewards."""
+        """The learner of `ERL.hybrid` alone, with the same network and the same view of rewards."""
         settings: dict[str, Any] = {"learner": modern(), "start_frames": 5_000}
-        settings |= {"normalize_observations": True, "redistribute": Even(late_only=True)}
+        settings |= {"redistribute": Even(late_only=True)}
         return cls(env, network or HYBRID_NETWORK, **settings | overrides)
 
     @classmethod

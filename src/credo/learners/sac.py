@@ -28,10 +28,10 @@ from ..networks.values import Histogram
 from ..types import Batch, Metrics
 from .base import AbstractLearner, Returns, Value, act, adam, adam_state, bellman, descend, polyak
 
-HYBRID_NETWORK = MLP(hidden=(64, 64), activation="tanh", initializer="uniform")
+HYBRID_NETWORK = MLP(hidden=(256, 256), activation="tanh", initializer="uniform")
 """An actor for mutation as well as for gradients: weights of a tanh network change what it does
 little by little. Swimmer, 500,000 frames of evolution alone: 353 and 346 with tanh, 294 and 81 with
-relu (2 x 256)."""
+relu."""
 
 Key = PRNGKeyArray
 Scalar = Float[Array, ""]
@@ -185,8 +185,7 @@ def modern(**fields: Any) -> SAC:
     """SAC with what later work found to matter and a CPU affords: LayerNorm in critics (Nauman et
     al. 2024), a distribution of the return (Farebrother et al. 2024), rewards scaled to what the
     buffer holds (Lee et al. 2025, "Hyperspherical Normalization", scale them to returns), and a
-    first temperature that fits them. It wants normalised observations, which are its algorithm's
-    part. Measured: docs, off-policy."""
+    first temperature that fits them. Measured: docs, hybrid."""
     critic = Critic(normalization="before", values=Histogram())
     settings: dict[str, Any] = {"critic": critic, "reward_scale": None, "temperature": 0.01}
     return SAC(**settings | fields)
