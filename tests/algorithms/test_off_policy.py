@@ -216,7 +216,7 @@ def test_presets_have_the_constants_of_their_authors():
         name: make(Meet() if name in teams else Copy())
         for name, make in OffPolicy.presets().items()
     }
-    assert set(presets) == {"td3", "ddpg", "sac", "matd3", "maddpg"}
+    assert set(presets) == {"td3", "ddpg", "sac", "matd3", "maddpg", "hybrid"}
     td3, sac = presets["td3"], presets["sac"]
     assert isinstance(td3.learner, TD3)
     assert (td3.start_frames, td3.network.hidden, td3.learner.policy_delay) == (

@@ -17,6 +17,7 @@ from ..algorithms.lineage import MAKERS
 from ..analysis import attribution, bounds
 from ..learners.base import AbstractLearner
 from ..runs import config
+from ..runs.names import algorithm_word
 from ..runs.record import RunError
 from ..runs.store import Run
 from .figures import shortened
@@ -105,7 +106,7 @@ def word(tree: Tree) -> str:
     name of its class."""
     name = _class(tree)
     if name == "ERL":
-        return ("ea", "erl", "cerl")[min(len(tree.get("learners", ())), 2)]
+        return algorithm_word(tree)
     if name == "OffPolicy":
         return _learner_word(tree["learner"])
     return name.lower() if tree["class"].startswith("credo.algorithms.") else name

@@ -18,9 +18,15 @@ def algorithm_word(algorithm: Mapping[str, Any]) -> str:
     of your own its name in lower case."""
     name = _class(algorithm)
     if name == "ERL":
-        learners = len(algorithm["learners"])
-        return "cerl" if algorithm["manager"] or learners > 1 else ("erl" if learners else "ea")
+        return _hybrid_word(algorithm, len(algorithm.get("learners", ())))
     return _learner_word(algorithm["learner"]) if name == "OffPolicy" else name.lower()
+
+
+def _hybrid_word(algorithm: Mapping[str, Any], learners: int) -> str:
+    """Presets of ERL by what tells them apart."""
+    if learners and algorithm.get("share"):
+        return "hybrid"
+    return "cerl" if algorithm.get("manager") or learners > 1 else ("erl" if learners else "ea")
 
 
 def task_word(env: Mapping[str, Any]) -> str:
