@@ -52,7 +52,7 @@ def code(path: pathlib.Path, firsts: set[int]) -> int:
 
 @pytest.mark.parametrize("env", [Copy(), Gymnasium("InvertedPendulum-v5", in_process=True)])
 def test_erl_and_what_it_calls_is_short(env):
-    """At most 815 lines, whether the task is JAX or not; the task itself is not counted."""
+    """At most 800 lines, whether the task is JAX or not; the task itself is not counted."""
     erl = ERL.erl(env, warmup_frames=1, replay_capacity=1000, updates_per_frame=0.1)
 
     def three_generations():
@@ -64,4 +64,4 @@ def test_erl_and_what_it_calls_is_short(env):
     files = {path.relative_to(SOURCE).as_posix() for path in found}
     assert {"algorithms/erl.py", "rollout.py", "replay.py", "learners/td3.py"} <= files
     mine = {path: at for path, at in found.items() if path.parent.name != "environments"}
-    assert sum(code(path, at) for path, at in mine.items()) <= 815
+    assert sum(code(path, at) for path, at in mine.items()) <= 800

@@ -78,13 +78,11 @@ class Experience(eqx.Module):
         """The last transition of every episode, `[pop·episodes, ...]`; that of another one where
         the episode was lost or not played."""
         steps = played.steps.reshape(-1)
-        if self.valid is not None:
+        if self.valid is None:  # the episodes, one behind the other, without the lost ones
+            at = np.cumsum(self.lived(played)) - 1
+        else:
             most = self.transitions.terminated.shape[0] // steps.size
             at = jnp.arange(steps.size) * most + steps - 1
-            return jax.tree.map(lambda x: x[at], self.transitions)
-        # The episodes, one behind the other, without the lost ones.
-        returns = np.asarray(next(iter(played.returns.values()))).reshape(steps.size, -1)
-        at = np.cumsum(np.where(np.isfinite(returns[:, 0]), steps, 0)) - 1
         return jax.tree.map(lambda x: x[at], self.transitions)
 
 
@@ -267,8 +265,7 @@ def _play(
             row = (Transition(obs, actions, step.rewards, step.obs, *ends), active)
             rows = jax.tree.map(lambda xs, x: xs.at[t].set(x), rows, row)
         active = active & ~(step.terminated | step.truncated)
-        seen = (step.obs, step.active)
-        return t + 1, states, seen, carries, active, (returns, steps, lost), rows
+        return t + 1, states, (step.obs, step.active), carries, active, (returns, steps, lost), rows
 
     *_, (returns, steps, lost), rows = jax.lax.while_loop(ongoing, advance, start)
     returns = jax.tree.map(lambda x: jnp.where(_over(lost, x), jnp.nan, x), returns)

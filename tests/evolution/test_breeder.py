@@ -27,7 +27,7 @@ STILL = Breeder(elite_fraction=0.25, mutation=MatrixMutation(probability=0.0))
 
 @eqx.filter_jit
 def bred(breeder, fitness, key):
-    return breeder(OLD, fitness, FRESH, key=key)
+    return breeder.next(None, OLD, fitness, FRESH, key=key)[:2]
 
 
 def breed(breeder, seed=0, fitness=FITNESS):

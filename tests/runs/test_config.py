@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from credo.algorithms.neuroevolution import Neuroevolution
+from credo.cli.names import CATALOGUE
 from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
@@ -154,3 +155,8 @@ def test_a_record_of_an_older_version_says_so():
     ):
         with pytest.raises(config.ConfigError, match="was written by an older version of Credo"):
             config.from_tree(old)
+
+
+def test_every_family_of_the_command_line_may_be_extended_by_a_recorded_class():
+    known = {kind.__name__ for kind in config.EXTENSIONS}
+    assert set(CATALOGUE["families"]) <= known

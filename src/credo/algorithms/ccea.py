@@ -204,7 +204,7 @@ def breed(
     fresh = partial(draw, ccea.network, ccea.env.sizes[:2])
 
     def one(population, fitness, key):
-        return ccea.breeder(population, fitness, fresh, key=key)[0]
+        return ccea.breeder.next(None, population, fitness, fresh, key=key)[0]
 
     return eqx.filter_vmap(one)(populations, fitness, jax.random.split(key, ccea.agents))
 

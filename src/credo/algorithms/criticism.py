@@ -90,10 +90,7 @@ def _in_lanes(experience: Experience, played: Evaluation, steps: int) -> tuple[T
     they come one behind the other, without the lost ones."""
     if experience.valid is not None:
         return experience.transitions, experience.valid
-    returns = np.asarray(next(iter(played.returns.values())))
-    length = np.asarray(played.steps).reshape(-1)
-    known = np.isfinite(returns).reshape(len(length), -1).all(axis=1)
-    valid = (np.arange(steps)[None] < (length * known)[:, None]).reshape(-1)
+    valid = (np.arange(steps)[None] < experience.lived(played)[:, None]).reshape(-1)
 
     def spaced(x: Any) -> Array:
         room = np.zeros((len(valid), *x.shape[1:]), x.dtype)

@@ -138,11 +138,10 @@ class Hybrid(eqx.Module):
         """1-4: Initialize learners, a population of k actors, and an empty cyclic replay buffer."""
         env, network, k, q = self.env, self.network, self.population_size, len(self.learners)
         require.continuous(env, *self.learners)
-        population_key, *keys = jax.random.split(key, 1 + q)
+        draw_key, *keys = jax.random.split(key, 1 + q)
         pairs = zip(self.learners, keys, strict=True)
-        population = draw(network, env.sizes, k, key=population_key)
-        first_key = jax.random.fold_in(population_key, k)
-        population, breeding = self.breeder.first(population, key=first_key)
+        population = draw(network, env.sizes, k, key=draw_key)
+        population, breeding = self.breeder.first(population, key=jax.random.fold_in(draw_key, k))
         moments = Moments.first(env, network) if self.normalize_observations else None
         return HybridState(
             population=population,
@@ -229,8 +228,7 @@ def breed(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key) -> 
 def bred(hybrid: Hybrid, memory, population: PyTree, lineage: Lineage, fitness, *, key: Key):
     """`breed` of what it needs, so that the replay buffer is not copied."""
     fresh = partial(draw, hybrid.network, hybrid.env.sizes)
-    given = (memory, population, fitness, fresh)
-    offspring, descent, memory = hybrid.breeder.next(*given, key=key)
+    offspring, descent, memory = hybrid.breeder.next(memory, population, fitness, fresh, key=key)
     best = ranking(fitness)[0]
     metrics = lineage.report(best, descent)
     return offspring, lineage.after(descent), memory, tree.take(population, best), metrics

@@ -129,23 +129,16 @@ class Breeder(AbstractBreeder):
     def first(self, population, *, key):
         return population, None
 
-    def next(self, memory, population, fitness, draw, *, key):
-        return *self(population, fitness, draw, key=key), None
-
     def warm(self, memory, population, policy):
         return tree.put(population, 0, policy), None
 
-    def __call__(self, population: PyTree, fitness: Fitness, draw: Draw, *, key: Key) -> Bred:
-        """The next population, of the same size, and where each member comes from.
-
-        **Arguments:** `fitness` is maximised; NaN ranks last. `draw(n, key=key)` makes `n` fresh
-        members, for extinctions and new islands. Call it inside a `jit`, which leaves out what
-        nothing reads of the descent.
-        """
+    def next(self, memory, population, fitness, draw, *, key):
+        """It remembers nothing. Fresh members are for extinctions and new islands. Call it inside a
+        `jit`, which leaves out what nothing reads of the descent."""
         rows, each, unpack = tree.packed(population)
         breed = partial(self._breed_apart, self.islands) if self.islands else self._breed
         rows, descent = breed(rows, each, partial(self._fresh, draw), fitness, key=key)
-        return unpack(rows), descent
+        return unpack(rows), descent, None
 
     def _breed(self, rows: Rows, each: Each, fresh: Draw, fitness: Fitness, *, key: Key) -> Bred:
         """The next generation of a population that is not in islands."""

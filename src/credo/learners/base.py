@@ -85,7 +85,7 @@ def learn(learner: AbstractLearner, state, replay: Replay, updates, **rest) -> L
 
 
 @jit
-def _learn(learner, state, replay: Replay, updates, *, signal, moments=None, sampling=UNIFORM, key):
+def _learn(learner, state, replay: Replay, updates, *, signal, key, **how):
     signal = learner.signal or signal
     learner = learner if learner.reward_scale is not None else scaled(learner, replay, signal)
     dynamic, static = eqx.partition(state, eqx.is_array)
@@ -93,8 +93,7 @@ def _learn(learner, state, replay: Replay, updates, *, signal, moments=None, sam
     def body(i, loop):
         dynamic, total = loop
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
-        how = {"signal": signal, "moments": moments, "sampling": sampling}
-        batch = minibatch(learner, replay, **how, key=sample_key)
+        batch = minibatch(learner, replay, signal=signal, **how, key=sample_key)
         state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)
         return eqx.filter(state, eqx.is_array), jax.tree.map(jnp.add, total, metrics)
 
@@ -103,8 +102,8 @@ def _learn(learner, state, replay: Replay, updates, *, signal, moments=None, sam
     return eqx.combine(dynamic, static), averaged(total, updates)
 
 
-def minibatch(learner, replay: Replay, *, signal, moments, sampling, key: PRNGKeyArray) -> Batch:
-    """What a learner learns from in one step."""
+def minibatch(learner, replay: Replay, *, signal, moments=None, sampling=UNIFORM, key) -> Batch:
+    """What a learner learns from in one step. Arguments as of `learn`."""
     given = (learner.batch_size, sampling, learner.gamma)
     rows, discount = replay.sample(*given, together=learner.together, key=key)
     reward, ends = rows.rewards[signal], (rows.terminated, rows.truncated)

@@ -65,8 +65,8 @@ class Coached(AbstractCoach):
     share: float = eqx.field(static=True, default=0.5)
     """Share of the population that is coached, in (0, 1]; rounded down."""
     per_update: float = 0.5
-    """Gradient steps of all coached members together per update of the learner, ≥ 0. A step costs
-    about a quarter of an update of TD3: one critic, and none of its weights."""
+    """Gradient steps of all coached members together per update of the learner, ≥ 0. A step takes
+    the gradient through one critic and none of that critic's weights."""
     learning_rate: float = 1e-3  # step size of Adam, ≥ 0
 
     def __check_init__(self):

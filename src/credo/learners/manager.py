@@ -60,16 +60,12 @@ class AbstractManager(eqx.Module):
             # A learner that returned NaN has had its turn, but no value that could be compared.
             good = jnp.isfinite(value)
             value = jnp.where(good, value, 0.0)
-            α = jnp.where(ledger.known[i], self.memory, 1.0)
+            α = jnp.where(ledger.known[i], self.memory, 1.0) * good.astype(jnp.float32)
             mean = α * value + (1.0 - α) * ledger.value[i]
             square = α * value**2 + (1.0 - α) * ledger.square[i]
-            after = Ledger(
-                jnp.where(good, ledger.value.at[i].set(mean), ledger.value),
-                jnp.where(good, ledger.square.at[i].set(square), ledger.square),
-                ledger.count.at[i].add(1),
-                ledger.known.at[i].set(ledger.known[i] | good),
-                ledger.before,
-            )
+            means = (ledger.value.at[i].set(mean), ledger.square.at[i].set(square))
+            known = ledger.known.at[i].set(ledger.known[i] | good)
+            after = Ledger(*means, ledger.count.at[i].add(1), known, ledger.before)
             return jax.tree.map(lambda a, b: jnp.where(counts, a, b), after, ledger), None
 
         return jax.lax.scan(one, ledger, (returns, played))[0]

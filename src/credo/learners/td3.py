@@ -124,19 +124,18 @@ class TD3(AbstractLearner):
     def update(self, state: TD3State, batch: Batch, *, key: Key) -> tuple[TD3State, Metrics]:
         given = (state.critics, batch, self.bellman_target(state, batch, key=key))
         rate = (self.critic_lr, self.critic_max_norm)
-        critics, critic_opt, (loss, q) = descend(critic_error, given, state.critic_opt, *rate)
+        critics, opts, (loss, q) = descend(critic_error, given, state.critic_opt, *rate)
 
         def moved():
             given, rate = (state.actor, critics[0], batch), (self.actor_lr, self.actor_max_norm)
             actor, opt, _ = descend(actor_loss, given, state.actor_opt, *rate)
-            return actor, opt, polyak(before[2], (actor, critics), self.tau)
+            return actor, opt, *polyak(before[2:], (actor, critics), self.tau)
 
-        before = (state.actor, state.actor_opt, (state.target_actor, state.target_critics))
+        before = (state.actor, state.actor_opt, state.target_actor, state.target_critics)
         due = state.step % self.policy_delay == 0
         after = jax.lax.cond(due, moved, lambda: before) if self.policy_delay > 1 else moved()
-        actor, opt, (target, targets) = after
-        counted = (state.step + 1, state.agents)
-        state = TD3State(actor, critics, target, targets, opt, critic_opt, *counted)
+        actor, opt, target, targets = after
+        state = TD3State(actor, critics, target, targets, opt, opts, state.step + 1, state.agents)
         return state, {"critic_loss": loss, "q": q}
 
     def bellman_target(self, state: TD3State, batch: Batch, *, key: Key) -> Returns:

@@ -73,7 +73,5 @@ class Explorer(AbstractPolicy):
         action, carry = self.policy(obs, carry)
         noise, before = self.noise(before, key=noise_key)
         drawn = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
-        action = action + noise
-        if self.clipped:
-            action = jnp.clip(action, -1.0, 1.0)
+        action = jnp.clip(action + noise, -1.0, 1.0) if self.clipped else action + noise
         return jnp.where(self.random, drawn, action), (carry, before, key)

@@ -36,6 +36,7 @@ from ..evolution.selection import AbstractSelection
 from ..learners.base import AbstractLearner
 from ..learners.coach import AbstractCoach
 from ..learners.credit import AbstractRedistribution
+from ..learners.fitness_critic import AbstractFitnessCritic
 from ..learners.horizon import AbstractHorizon
 from ..learners.manager import AbstractManager
 from ..learners.share import AbstractShare
@@ -64,6 +65,7 @@ EXTENSIONS = (
     AbstractSurrogate,
     AbstractHorizon,
     AbstractRedistribution,
+    AbstractFitnessCritic,
 )
 PACKAGES = ("credo", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
 
