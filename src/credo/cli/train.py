@@ -216,9 +216,10 @@ def _without_injection(algorithm: Any, run: Any) -> str:
         period, done = getattr(algorithm, name, 0), int(run.metrics["generation"][-1])
         if getattr(algorithm, "learners", ()) and done <= period:
             often = "generation" if period == 1 else f"{period} generations"
+            less = "" if period == 1 else f", or fewer --{name.replace('_', '-')}"
             return (
                 f"{run.path} is evolution alone: its learners join the population every {often}, "
-                f"and it made {done}: give more --frames, or fewer --{name.replace('_', '-')}"
+                f"and it made {done}: give more --frames{less}"
             )
     return ""
 
