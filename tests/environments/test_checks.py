@@ -11,7 +11,7 @@ import pytest
 
 from credo.environments.base import AbstractEnvironment
 from credo.environments.checks import check_environment
-from credo.environments.probes import Copy, Meet, Remember
+from credo.environments.probes import Copy, Locked, Meet, Remember
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
 from credo.types import Sequence, TimeStep
@@ -21,6 +21,7 @@ from credo.types import Sequence, TimeStep
     "env",
     [
         Copy(size=2, max_steps=3),
+        Locked(size=2, hold=1, max_steps=3),
         Remember(delay=2),
         Meet(),
         SequenceClassification(depth=2, min_gap=0, max_gap=2),

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from credo.environments.probes import Copy, Meet, Remember
+from credo.environments.probes import Copy, Locked, Meet, Remember
 
 
 def play(env, policy, keys):
@@ -49,6 +49,28 @@ def test_copy_pays_minus_the_squared_distance(keys):
     assert idle["reward"].mean() == pytest.approx(-2 * 4 / 3, rel=0.1)
     off, *_ = play(env, lambda obs: obs + 0.5, keys)
     np.testing.assert_allclose(off["reward"], -4 * 2 * 0.25, rtol=1e-5)
+
+
+def test_copying_is_paid_behind_a_lever_that_was_held(keys):
+    env = Locked(size=3, threshold=0.3, hold=4, effort=0.1, max_steps=10)
+
+    def pulled(lever, copies=1.0):
+        """Pull in the first part, and copy throughout."""
+        return lambda obs: jnp.append(copies * obs[:3], jnp.where(obs[-1] < 0.4, lever, 0.0))
+
+    for lever in (0.31, -0.31):
+        returns, steps, last = play(env, pulled(lever), keys)
+        np.testing.assert_allclose(returns["reward"], 6.0 - 4 * 0.1 * 0.31, rtol=1e-5)
+        assert (steps == 10).all()
+        assert last.truncated.all()
+        assert not last.terminated.any()
+    short, *_ = play(env, pulled(0.29), keys)
+    np.testing.assert_allclose(short["reward"], -4 * 0.1 * 0.29, rtol=1e-5)
+    alone, *_ = play(env, pulled(0.31, copies=0.0), keys)
+    assert alone["reward"].mean() == pytest.approx(3.0 - 0.124, rel=0.05)
+    # Held too late, in the second part alone.
+    late, *_ = play(env, lambda obs: jnp.append(obs[:3], jnp.where(obs[-1] < 0.4, 0.0, 1.0)), keys)
+    np.testing.assert_allclose(late["reward"], -0.6, rtol=1e-5)
 
 
 def test_remember_asks_at_the_end_for_what_it_showed_first():
@@ -101,5 +123,9 @@ def test_impossible_probes_are_refused():
         Copy(size=0)
     with pytest.raises(ValueError, match="max_steps is 0"):
         Copy(max_steps=0)
+    with pytest.raises(ValueError, match="hold is 32"):
+        Locked(hold=32)
+    with pytest.raises(ValueError, match="threshold is -1"):
+        Locked(threshold=-1.0)
     with pytest.raises(ValueError, match="delay is 0"):
         Remember(delay=0)

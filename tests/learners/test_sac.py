@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import itertools
 
 import equinox as eqx
 import jax
@@ -123,6 +124,21 @@ def test_updates_are_those_of_the_equations(start):
         assert float(state.log_alpha) == pytest.approx(by_hand.log_alpha[0][""], abs=1e-5)
 
 
+def test_a_delayed_actor_moves_with_every_second_update_of_the_critics(start):
+    late, states, losses = dataclasses.replace(LEARNER, policy_delay=2), [start], []
+    for step in range(4):
+        state, metrics = update(late, states[-1], batch_of(step), jax.random.key(step))
+        states.append(state)
+        losses.append(float(metrics["actor_loss"]))
+    moved = [not same(a.actor, b.actor) for a, b in itertools.pairwise(states)]
+    warmed = [float(a.log_alpha) != float(b.log_alpha) for a, b in itertools.pairwise(states)]
+    assert moved == warmed == [True, False, True, False]
+    assert all(not same(a.critics, b.critics) for a, b in itertools.pairwise(states))
+    # The loss of the first update counts for the second too.
+    _, at_once = update(LEARNER, start, batch_of(0), jax.random.key(0))
+    assert losses[:2] == [pytest.approx(2.0 * float(at_once["actor_loss"]), rel=1e-4), 0.0]
+
+
 def fixed(mean, log_std):
     """A policy of one action that ignores what it sees."""
     zeros = {"W_0": jnp.zeros((1, 1)), "b_0": jnp.zeros(1), "W_1": jnp.zeros((1, 1))}
@@ -232,7 +248,7 @@ def test_a_reward_scale_is_that_of_the_rewards(start):
     assert not same(a, update(LEARNER, start, batch, jax.random.key(0))[0].critics)
 
 
-@pytest.mark.parametrize("field", ["gamma", "tau", "alpha_lr", "critics"])
+@pytest.mark.parametrize("field", ["gamma", "tau", "alpha_lr", "critics", "policy_delay"])
 def test_impossible_settings_are_refused(field):
     with pytest.raises(ValueError, match=f"{field} is -1"):
         SAC(**{field: -1})

@@ -1,5 +1,7 @@
 """Who gets the frames."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,17 +12,22 @@ from credo.environments.probes import Copy
 from credo.learners.share import Earned, Fixed
 from credo.learners.td3 import TD3
 from credo.networks.mlp import MLP, Critic
+from credo.runs.loop import resume, train
 
 LEARNER = TD3(critic=Critic(hidden=(4,)), batch_size=4)
 SMALL = {"population_size": 4, "elite_fraction": 0.25, "warmup_frames": 0, "sync_period": 1}
 
 
-def test_learners_earn_the_part_of_the_population_that_they_beat():
+def test_learners_earn_frames_while_their_best_beats_every_other_member():
     share = Earned(0.2, 0.8, memory=0.5)
     fitness = jnp.asarray([3.0, 1.0, 2.0, 0.0])
-    guests = jnp.asarray([False, False, True, False])
-    # It beats two of three: the aim is 0.2 + 0.6·2/3 = 0.6, and half of the way is gone.
-    assert share.after(jnp.float32(0.4), fitness, guests) == pytest.approx(0.5)
+    guests = jnp.asarray([False, False, True, True])
+    # The best of two is second: half of the way from 0.4 to the least. Without the first, to most.
+    assert share.after(jnp.float32(0.4), fitness, guests) == pytest.approx(0.3)
+    assert share.after(jnp.float32(0.4), fitness.at[0].set(1.9), guests) == pytest.approx(0.6)
+    # A draw is no reason to give more.
+    assert share.after(jnp.float32(0.4), fitness.at[0].set(2.0), guests) == pytest.approx(0.3)
+    assert share.after(jnp.float32(0.4), fitness, ~guests) == pytest.approx(0.6)
     none = jnp.zeros(4, bool)
     assert share.after(jnp.float32(0.4), fitness, none) == pytest.approx(0.4)
     assert share.first() == pytest.approx(0.5)
@@ -43,6 +50,23 @@ def test_learners_play_in_rounds_until_they_have_their_share(learners, rounds):
     assert state.replay.written == state.frames
     assert np.isfinite(metrics["critic_loss_0"])
     assert frames * (4 + rounds) <= erl.most_frames
+
+
+def test_learners_stop_where_the_budget_of_a_run_does(tmp_path):
+    """A generation has 40 frames of the population and 120 of the learner: of the second, budgets
+    leave less, and one round of 10 at least. A larger budget moves the end."""
+    erl = ERL.erl(Copy(), MLP((4,)), learners=(LEARNER,), share=Fixed(0.75), **SMALL)
+
+    def frames(run):
+        return run.metrics["frames"].astype(int).tolist()
+
+    run = train(erl, path=tmp_path / "a", frames=250)
+    assert frames(run) == [160, 250]
+    assert frames(train(erl, path=tmp_path / "b", frames=170)) == [160, 210]
+    assert run.algorithm.share.until is None  # as the user said
+    assert frames(resume(run.path, frames=500)) == [160, 250, 410, 500]
+    own = dataclasses.replace(erl, share=Fixed(0.75, until=200.0))
+    assert frames(train(own, path=tmp_path / "c", frames=250)) == [160, 210, 260]
 
 
 @pytest.mark.parametrize(

@@ -274,8 +274,11 @@ def _until_shared(hybrid: Hybrid, state: HybridState, metrics: Metrics, frames: 
     """`teach` from its second round on."""
     wanted = state.share / (1.0 - state.share) * frames.astype(jnp.float32)
 
+    until = jnp.inf if hybrid.share.until is None else hybrid.share.until
+
     def due(loop) -> Bool[Array, ""]:
-        return (loop[1]["frames"] - frames).astype(jnp.float32) < wanted
+        mine = (loop[1]["frames"] - frames).astype(jnp.float32)
+        return (mine < wanted) & (loop[0].frames.astype(jnp.float32) < until)
 
     def again(loop):
         state, before, turn = loop

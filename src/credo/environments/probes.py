@@ -6,6 +6,7 @@ and the best possible return is written beside it.
 | probe | needs | best | without it |
 |---|---|---|---|
 | `Copy` | the observation reaches the action | 0 | -size·max_steps/3 (action 0) |
+| `Locked` | exploration by whole policies, then gradients | `max_steps` - `hold` | 0 |
 | `Remember` | memory across `delay` steps | 1 | success ½ |
 | `Meet` | both agents of a team act | 1 (global) | 0 |
 """
@@ -65,6 +66,68 @@ class Copy(AbstractEnvironment):
         obs = jax.random.uniform(key, (self.size,), minval=-1.0, maxval=1.0)
         truncated = step >= self.max_steps
         return CopyState(obs, step), TimeStep(obs, {"reward": reward}, jnp.bool_(False), truncated)
+
+
+class LockedState(eqx.Module):
+    shown: Float[Array, " size"]  # what is to be copied
+    lever: Float[Array, ""]  # its mean over the steps of the first part so far
+    step: Int[Array, ""]
+
+
+class Locked(AbstractEnvironment):
+    """Copy behind a lock: for the first `hold` steps the last action moves a lever, and only if its
+    mean was beyond ±`threshold` is copying paid in the steps that follow, 1 less the mean distance.
+
+    Each step costs `effort` times the size of the lever's action, so that gradients lead away from
+    the lever, and noise that is new in each step averages out: a learner alone ends near 0. Members
+    of a population differ for whole episodes: evolution finds the lever, and comes to copy slowly.
+    Observations are [what to copy, new in every step and uniform in [-1, 1]; the lever; the time in
+    [0, 1]]. The clock ends the episode (truncated). Best return `max_steps` - `hold`, less the
+    effort; action 0 has 0, the lever alone half of the best.
+    """
+
+    signals: ClassVar[tuple[str, ...]] = ("reward",)
+    obs_range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
+
+    size: int = eqx.field(static=True, default=8)  # numbers to copy, at least 1
+    threshold: float = 0.3  # of the lever's mean, in [0, 1]
+    hold: int = eqx.field(static=True, default=16)  # steps with the lever, in [1, max_steps - 1]
+    effort: float = 0.1  # what a full pull costs in a step, at least 0
+    max_steps: int = eqx.field(static=True, default=32)  # length of every episode, at least 2
+
+    def __check_init__(self):
+        require.at_least("size", self.size, 1)
+        require.at_least("max_steps", self.max_steps, 2)
+        require.within("threshold", self.threshold, 0, 1)
+        require.within("hold", self.hold, 1, self.max_steps - 1)
+        require.at_least("effort", self.effort, 0)
+
+    @property
+    def obs_size(self) -> int:
+        return self.size + 2
+
+    @property
+    def action_size(self) -> int:
+        return self.size + 1
+
+    def reset(self, *, key: PRNGKeyArray) -> tuple[LockedState, TimeStep]:
+        return self._at(jnp.int32(0), jnp.float32(0.0), jnp.float32(0.0), key)
+
+    def step(
+        self, state: LockedState, action: Float[Array, " size+1"], *, key: PRNGKeyArray
+    ) -> tuple[LockedState, TimeStep]:
+        copied = 1.0 - jnp.mean(jnp.abs(action[:-1] - state.shown))
+        paid = (state.step >= self.hold) & (jnp.abs(state.lever) > self.threshold)
+        reward = jnp.where(paid, copied, 0.0) - self.effort * jnp.abs(action[-1])
+        pulled = jnp.where(state.step < self.hold, action[-1] / self.hold, 0.0)
+        return self._at(state.step + 1, state.lever + pulled, reward, key)
+
+    def _at(self, step, lever, reward, key):
+        shown = jax.random.uniform(key, (self.size,), minval=-1.0, maxval=1.0)
+        time = step.astype(jnp.float32) / self.max_steps
+        obs = jnp.concatenate([shown, jnp.stack([lever, time])])
+        told = TimeStep(obs, {"reward": reward}, jnp.bool_(False), step >= self.max_steps)
+        return LockedState(shown, lever, step), told
 
 
 class Remember(AbstractSequenceTask):

@@ -2,7 +2,8 @@
 population.
 
 A generation of the population has a fixed number of episodes. The learners then play and learn, one
-round of episodes after the other, until they have had their share of all frames.
+round of episodes after the other, until they have had their share of all frames. At a large share
+that is most of a generation, so it ends early where a run's budget does: `until`.
 """
 
 import abc
@@ -16,6 +17,10 @@ from .. import require
 
 class AbstractShare(eqx.Module):
     """The learners' share of all frames, from generation to generation."""
+
+    until: eqx.AbstractVar[float | None]
+    """Frames of the run after which a generation has one round of the learners; None: none. A run
+    puts its budget here."""
 
     @property
     @abc.abstractmethod
@@ -38,6 +43,7 @@ class Fixed(AbstractShare):
     """The same share in every generation."""
 
     learners: float = eqx.field(static=True, default=0.5)  # of all frames, in [0, 1)
+    until: float | None = None  # frames of the run after which learners play one round; None: none
 
     def __check_init__(self):
         require.within("learners", self.learners, 0, 0.99)
@@ -54,12 +60,13 @@ class Fixed(AbstractShare):
 
 
 class Earned(AbstractShare):
-    """As many frames as the learners' actors have earned: their share follows the part of the
-    population that they beat on the day they join it."""
+    """As many frames as the learners' actors have earned: their share rises while the best of those
+    that joined the population is better than every member of its own, and falls otherwise."""
 
     least: float = eqx.field(static=True, default=0.1)  # no share is smaller, in [0, most]
     most: float = eqx.field(static=True, default=0.9)  # no share is larger, in [least, 1)
-    memory: float = 0.2  # weight of the newest generation, in (0, 1]
+    memory: float = 0.5  # weight of the newest generation, in (0, 1]
+    until: float | None = None  # frames of the run after which learners play one round; None: none
 
     def __check_init__(self):
         require.within("most", self.most, 0, 0.99)
@@ -70,8 +77,7 @@ class Earned(AbstractShare):
         return 0.5 * (self.least + self.most)
 
     def after(self, share, fitness, guests):
-        beaten = (fitness[:, None] > fitness[None]) & guests[:, None] & ~guests[None]
-        pairs = jnp.sum(guests) * jnp.sum(~guests)
-        part = jnp.sum(beaten).astype(jnp.float32) / jnp.maximum(pairs, 1).astype(jnp.float32)
-        aim = self.least + (self.most - self.least) * part
-        return jnp.where(pairs > 0, share + self.memory * (aim - share), share)
+        best = jnp.max(fitness, initial=-jnp.inf, where=guests)
+        own = jnp.max(fitness, initial=-jnp.inf, where=~guests)
+        aim = jnp.where(best > own, self.most, self.least)
+        return jnp.where(jnp.any(guests), share + self.memory * (aim - share), share)

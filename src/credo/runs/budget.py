@@ -85,12 +85,13 @@ class Budget:
 
 
 def fitted(algorithm: Any, budget: Budget) -> Any:
-    """`algorithm` with a replay buffer that is no larger than what `budget` can fill: as long as it
-    never wraps, its capacity changes no bit. What is recorded stays the user's number; in use is
-    the next power of two, so that budgets of about the same size are one program.
+    """`limited` to a budget, and with a replay buffer that is no larger than what it can fill: as
+    long as that never wraps, its capacity changes no bit. What is recorded stays the user's number;
+    in use is the next power of two, so that budgets of about the same size are one program.
 
     It needs `most_frames`, an upper bound of the frames of one generation.
     """
+    algorithm = limited(algorithm, budget)
     capacity = getattr(algorithm, "replay_capacity", None)
     most = getattr(algorithm, "most_frames", None)
     if capacity is None or most is None:
@@ -102,6 +103,16 @@ def fitted(algorithm: Any, budget: Budget) -> Any:
         bounds.append(budget.frames - 1 + most)  # the last generation begins before the limit
     rows = min(capacity, 1 << (max(1, min(bounds)) - 1).bit_length())
     return dataclasses.replace(algorithm, replay_capacity=rows)
+
+
+def limited(algorithm: Any, budget: Budget) -> Any:
+    """`algorithm` whose learners have their share of frames until the budget is spent: their rounds
+    alone may be a sixth of it. What is recorded stays what the user said."""
+    share = getattr(algorithm, "share", None)
+    if share is None or share.until is not None or budget.frames is None:
+        return algorithm
+    share = dataclasses.replace(share, until=float(budget.frames))
+    return dataclasses.replace(algorithm, share=share)
 
 
 def short(number: float) -> str:

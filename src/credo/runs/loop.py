@@ -32,7 +32,7 @@ from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..replay import shapes_alone
 from ..types import NOTHING
 from . import callbacks, checkpoint, config, files, log, record, screen, segments, weights
-from .budget import Budget, fitted
+from .budget import Budget, fitted, limited
 from .folder import free_name, new_folder
 from .lock import lock
 from .options import RunOptions
@@ -298,7 +298,7 @@ def _reopened(
     if budget != old:
         _note(run, saved.generation, budget=dataclasses.asdict(old))
         run.config["budget"] = dataclasses.asdict(budget)
-    return fit, saved
+    return limited(fit, budget), saved
 
 
 def _changed(run: Run, fit: Any, settings: dict[str, Any], generation: int) -> Any:
