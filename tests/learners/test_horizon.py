@@ -98,6 +98,14 @@ def test_the_population_plays_less_and_learners_play_on(played):
     np.testing.assert_allclose(whole.returns["reward"], plain.returns["reward"], rtol=1e-6)
 
 
+def test_a_learner_that_scales_rewards_sees_the_buffer_that_is_there(played):
+    """Outside one large program the old buffer is gone once the new one is made."""
+    erl, state = played
+    scaling = replace(erl, learners=(replace(LEARNER, reward_scale=None),))
+    _, ahead = play_ahead(scaling, kept(state), state.population, 1, key=jax.random.key(5))
+    assert np.isfinite(ahead.returns["reward"]).all()
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [

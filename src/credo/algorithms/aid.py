@@ -74,9 +74,9 @@ def play_ahead(
     limit = jnp.where(state.learned, jnp.minimum(hybrid.horizon.steps, most), most)
     acting = behind(state.moments, policies)
     played, new = collect(hybrid.env, acting, episodes, limit=limit, key=key)
-    about = (hybrid.learners[0], state.learners[0], state.replay, state.moments)
     cut = (played.steps == limit) & (limit < most)
-    after = stored(hybrid, state, played, new)
+    after = stored(hybrid, state, played, new)  # from here on the old replay buffer is gone
+    about = (hybrid.learners[0], state.learners[0], after.replay, state.moments)
     if not len(new.transitions.terminated):  # every episode was lost
         return after, played
     rest = _rest(hybrid.reward, about, policies, new.last(played), cut)
