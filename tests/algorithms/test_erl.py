@@ -523,6 +523,9 @@ def test_the_hybrid_and_its_learner_alone_differ_in_nothing_else():
         assert getattr(alone, name) == getattr(hybrid, name)
     assert alone.updates_per_frame == hybrid.updates_per_frame == 1.0
     assert hybrid.redistribute == Even(late_only=True)  # dense rewards stay as they are
+    evolution = ERL.hybrid(Copy(), learners=())  # needs nothing that asks a learner
+    assert (evolution.share, evolution.horizon) == (None, None)
+    assert evolution.breeder == hybrid.breeder
     assert ERL.hybrid(Copy(), elite_fraction=0.3).breeder.elite_fraction == 0.3
     with pytest.raises(ValueError, match="train a team by merl"):
         ERL.hybrid(Meet())

@@ -12,6 +12,7 @@ from credo.algorithms.aid import play_ahead
 from credo.algorithms.erl import ERL
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy
+from credo.environments.wrappers import delayed
 from credo.evolution.breeder import draw
 from credo.learners.credit import Even
 from credo.learners.horizon import Truncated
@@ -104,6 +105,16 @@ def test_a_learner_that_scales_rewards_sees_the_buffer_that_is_there(played):
     scaling = replace(erl, learners=(replace(LEARNER, reward_scale=None),))
     _, ahead = play_ahead(scaling, kept(state), state.population, 1, key=jax.random.key(5))
     assert np.isfinite(ahead.returns["reward"]).all()
+
+
+def test_episodes_are_whole_where_all_is_paid_at_their_last_step():
+    fields = {"learners": (LEARNER,), "horizon": Truncated(3), **SMALL}
+    erl = ERL.erl(delayed(Copy()), NETWORK, redistribute=Even(late_only=True), **fields)
+    state = erl.init(key=jax.random.key(0))
+    for step in range(3):
+        state, metrics = erl.generation(state, key=jax.random.key(step))
+        assert metrics["frames"] == 5 * 10
+    assert bool(state.learned)
 
 
 @pytest.mark.parametrize(

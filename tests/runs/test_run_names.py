@@ -26,7 +26,7 @@ def test_every_algorithm_has_the_word_that_made_it(word):
 
 def test_a_preset_does_not_change_the_word():
     assert algorithm_word(to_tree(ERL.ours(Copy()))) == "erl"
-    assert algorithm_word(to_tree(ERL.hybrid(Copy(), learners=(), share=None))) == "ea"
+    assert algorithm_word(to_tree(ERL.hybrid(Copy(), learners=()))) == "ea"
     assert algorithm_word(to_tree(Neuroevolution.ours(Remember(), MMU()))) == "neuroevolution"
 
 

@@ -67,14 +67,18 @@ def preselect(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key)
 def play_ahead(
     hybrid: Hybrid, state: HybridState, policies: PyTree, episodes: int, *, key: Key
 ) -> Played:
-    """`play` for as many steps as the hybrid's `horizon` says, once the learner has learned. To the
-    returns of episodes that were cut short the value of their last state is added."""
+    """`play` for as many steps as the hybrid's `horizon` says, once the learner has learned and
+    unless the task pays late. To the returns of episodes that were cut short the value of their
+    last state is added."""
     assert hybrid.horizon is not None
     most = jnp.int32(hybrid.env.max_steps)
-    limit = jnp.where(state.learned, jnp.minimum(hybrid.horizon.steps, most), most)
+    short = state.learned & ~state.late
+    limit = jnp.where(short, jnp.minimum(hybrid.horizon.steps, most), most)
     acting = behind(state.moments, policies)
     played, new = collect(hybrid.env, acting, episodes, limit=limit, key=key)
     cut = (played.steps == limit) & (limit < most)
+    late = state.late & jnp.all(new.late(played, hybrid.reward))
+    state = replace(state, late=late)
     after = stored(hybrid, state, played, new)  # from here on the old replay buffer is gone
     about = (hybrid.learners[0], state.learners[0], after.replay, state.moments)
     if not len(new.transitions.terminated):  # every episode was lost

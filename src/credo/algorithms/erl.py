@@ -39,7 +39,7 @@ from ..evolution.mutation import MatrixMutation
 from ..learners.base import AbstractLearner
 from ..learners.coach import AbstractCoach
 from ..learners.credit import AbstractRedistribution, Even
-from ..learners.horizon import AbstractHorizon
+from ..learners.horizon import AbstractHorizon, Truncated
 from ..learners.manager import UCB, AbstractManager
 from ..learners.sac import HYBRID_NETWORK, modern
 from ..learners.share import AbstractShare, Earned
@@ -148,14 +148,17 @@ class ERL(Hybrid):
 
     @classmethod
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """One preset for dense and late rewards: policies that mutation moves, beside a learner of
-        this decade that earns its frames, joins every generation, and sees late returns spread.
-        Chosen on seeds from 1000 on; docs, hybrid, say by what."""
+        """One preset for dense and late rewards: policies that mutation moves, judged by 200 steps
+        and the critic, beside a learner of this decade that earns its frames, joins every
+        generation, and sees late returns spread. Chosen on seeds from 1000 on; docs, hybrid, say by
+        what."""
         if env.agents is not None:
             raise ValueError("hybrid is for one agent: train a team by merl, or MERL.merl(env)")
         settings: dict[str, Any] = {"learners": (modern(),), "share": Earned(0.5, 0.9)}
         settings |= {"elite_fraction": 0.2, "sync_period": 1, "redistribute": Even(late_only=True)}
-        settings |= {"warmup_frames": 5_000}
+        settings |= {"warmup_frames": 5_000, "horizon": Truncated(200)}
+        if overrides.get("learners") == ():  # evolution alone: nobody to share with or to ask
+            settings |= {"share": None, "horizon": None}
         return cls(env, network or HYBRID_NETWORK, **evolving(BREEDER, settings, overrides))
 
     @classmethod

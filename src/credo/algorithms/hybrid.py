@@ -56,6 +56,7 @@ class HybridState(eqx.Module):
     """Of the champion that was tested last; -inf: none was."""
     share: Float[Array, ""] = _field(0.0, jnp.float32)  # of the frames that the learners get
     known: PyTree = None  # what a redistribution knows
+    late: Bool[Array, ""] = _field(True, jnp.bool_)  # whether all was paid at last steps, if asked
     frames: Int[Array, ""] = _field(0, jnp.int32)
     episodes: Int[Array, ""] = _field(0, jnp.int32)
     generation: Int[Array, ""] = _field(0, jnp.int32)

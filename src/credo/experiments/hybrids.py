@@ -29,7 +29,7 @@ SPREAD = "its learner alone, returns spread"
 METHODS = {
     HYBRID: ERL.hybrid,
     LEARNER: partial(OffPolicy.hybrid, redistribute=None),
-    EVOLUTION: partial(ERL.hybrid, learners=(), share=None),
+    EVOLUTION: partial(ERL.hybrid, learners=()),
 }
 DENSE = {
     "smoke": Plan(600, 2),

@@ -9,7 +9,9 @@ A member's fitness is its return until it is cut off and the critic's value of t
 it is, with the member's own action there. All members of a generation are cut after as many steps,
 so that their fitness is comparable; a member whose episode terminated before has its return alone.
 The value is discounted by the learner's γ, while returns are not: it stands for about 1/(1 - γ)
-further steps. Tests of champions and the learners' own episodes are whole ones.
+further steps. Tests of champions and the learners' own episodes are whole ones, and so are all
+while no member was ever paid before the last step of an episode: what is cut off there is the whole
+return.
 
 Departures: they discount the H rewards too, use a value function that takes the policy as an input,
 and evaluate like this with some probability; here it is the learner's own critic, in every
@@ -38,12 +40,13 @@ class AbstractHorizon(eqx.Module):
         frame by frame."""
         require_critic(self, learners)
         signal = learners[0].signal or reward
+        credit = None if credit is not None and credit.late_only else credit
         if signal != reward or credit is not None:
             paid = "by a redistribution" if credit else f"{signal!r}"
             raise ValueError(
                 f"{type(self).__name__} adds the critic's value to a return of {reward!r}, and the "
                 f"first learner is paid {paid}: put a learner of {reward!r} first, without "
-                "redistribute, or leave the horizon out"
+                "redistribute or with one that is late_only, or leave the horizon out"
             )
 
 
