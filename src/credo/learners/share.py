@@ -60,8 +60,9 @@ class Fixed(AbstractShare):
 
 
 class Earned(AbstractShare):
-    """As many frames as the learners' actors have earned: their share rises while the best of those
-    that joined the population is better than every member of its own, and falls otherwise."""
+    """As many frames as the learners' actors have earned: what their share tends to is the most
+    while the best of those that just joined is the best of the population, and halves, down to the
+    least, with each member of the population's own that is better."""
 
     least: float = eqx.field(static=True, default=0.1)  # no share is smaller, in [0, most]
     most: float = eqx.field(static=True, default=0.9)  # no share is larger, in [least, 1)
@@ -78,6 +79,6 @@ class Earned(AbstractShare):
 
     def after(self, share, fitness, guests):
         best = jnp.max(fitness, initial=-jnp.inf, where=guests)
-        own = jnp.max(fitness, initial=-jnp.inf, where=~guests)
-        aim = jnp.where(best > own, self.most, self.least)
+        better = jnp.sum((fitness > best) & ~guests)
+        aim = self.least + (self.most - self.least) * jnp.exp2(-better.astype(jnp.float32))
         return jnp.where(jnp.any(guests), share + self.memory * (aim - share), share)
