@@ -1,7 +1,7 @@
 """Hybrids learn what neither of their parts does: `Locked`, whose best return is near 16.
 
 Evolution alone finds the lever and copies badly, a learner alone lets the lever go. The bounds
-were chosen on seeds 0, 1 and 100: ERL 13.1 to 13.3, CERL 12.2 to 13.9, evolution 6.7 to 8.3.
+were chosen on seeds 0, 1, 2, 7, 8 and 100: ERL 8.4 to 12.9, evolution -0.1 to 5.2.
 """
 
 import dataclasses
@@ -18,6 +18,7 @@ from credo.networks.mlp import MLP, Critic
 pytestmark = pytest.mark.slow
 
 FRAMES = 100_000
+LOCK, OPEN = Locked(size=12), Locked(size=12, threshold=0.0)
 NETWORK = MLP((32,), "tanh", initializer="uniform")
 RATES = {"actor_lr": 3e-3, "critic_lr": 3e-3}
 TD = TD3(critic=Critic((64, 64)), batch_size=64, gamma=0.9, **RATES)
@@ -28,25 +29,25 @@ ALONE = {"episodes": 20, "start_frames": 100, "test_every": 10_000, **TESTS}
 
 
 def erl(learners, **fields):
-    return ERL.erl(Locked(size=12), NETWORK, learners=learners, episodes=1, **HYBRID | fields)
+    return ERL.erl(LOCK, NETWORK, learners=learners, episodes=1, **HYBRID | fields)
 
 
 def cerl():
     fields = {"learners": (TD, SHORT), "workers": 2, "test_every": 1, "updates_per_frame": 0.125}
-    return ERL.cerl(Locked(size=12), NETWORK, **HYBRID | fields)
+    return ERL.cerl(LOCK, NETWORK, **HYBRID | fields)
 
 
-def td3(learner):
-    alone = {"learner": learner, "updates_per_frame": 0.25, **ALONE}
-    return OffPolicy.td3(Locked(size=12), NETWORK, **alone)
+def td3(learner, env=LOCK):
+    return OffPolicy.td3(env, NETWORK, learner=learner, updates_per_frame=0.25, **ALONE)
 
 
 METHODS = {  # who learns, and the return of the final champion: at least, at most
-    "ERL": (erl((TD,), updates_per_frame=0.25), 11.0, 16.0),
-    "CERL": (cerl(), 11.0, 16.0),
-    "evolution alone": (erl(()), -2.0, 9.5),
+    "ERL": (erl((TD,), updates_per_frame=0.25), 9.0, 16.0),
+    "CERL": (cerl(), 9.0, 16.0),
+    "evolution alone": (erl(()), -2.0, 7.5),
     "the learner alone": (td3(TD), -1.0, 0.5),
     "the other learner alone": (td3(SHORT), -1.0, 0.5),
+    "the learner alone, no lock": (td3(TD, OPEN), 9.0, 16.0),  # it does learn to copy
 }
 
 

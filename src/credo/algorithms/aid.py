@@ -77,25 +77,26 @@ def play_ahead(
     acting = behind(state.moments, policies)
     played, new = collect(hybrid.env, acting, episodes, limit=limit, key=key)
     cut = (played.steps == limit) & (limit < most)
+    learner = hybrid.learners[0]
+    if learner.reward_scale is None:  # by the buffer that the critic has learned from
+        learner = scaled(learner, state.replay, hybrid.reward)
+    about = (learner, state.learners[0], state.moments)
     late = state.late & jnp.all(new.late(played, hybrid.reward))
-    state = replace(state, late=late)
-    after = stored(hybrid, state, played, new)  # from here on the old replay buffer is gone
-    about = (hybrid.learners[0], state.learners[0], after.replay, state.moments)
+    after = stored(hybrid, replace(state, late=late), played, new)
     if not len(new.transitions.terminated):  # every episode was lost
         return after, played
-    rest = _rest(hybrid.reward, about, policies, new.last(played), cut)
+    rest = _rest(about, policies, new.last(played), cut)
     returns = played.returns | {hybrid.reward: played.of(hybrid.reward) + rest}
     return after, replace(played, returns=returns)
 
 
 @jit
 def _rest(
-    reward: str, about: PyTree, policies: PyTree, last: Transition, cut: Bool[Array, "pop episodes"]
+    about: PyTree, policies: PyTree, last: Transition, cut: Bool[Array, "pop episodes"]
 ) -> Float[Array, "pop episodes"]:
     """What the critic says of the states in which episodes were `cut`, in units of the reward; 0 of
     those that terminated just then, and of all others."""
-    learner, state, replay, moments = about
-    learner = learner if learner.reward_scale is not None else scaled(learner, replay, reward)
+    learner, state, moments = about
     obs = seen(moments, jnp.asarray(last.next_obs)).reshape(*cut.shape, *last.next_obs.shape[1:])
     arrays, static = eqx.partition(policies, eqx.is_array)
 

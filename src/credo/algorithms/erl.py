@@ -154,10 +154,10 @@ class ERL(Hybrid):
         what."""
         if env.agents is not None:
             raise ValueError("hybrid is for one agent: train a team by merl, or MERL.merl(env)")
-        settings: dict[str, Any] = {"learners": (modern(),), "share": Earned(0.5, 0.9)}
+        settings: dict[str, Any] = {"learners": (modern(),), "share": Earned(0.7, 0.9)}
         settings |= {"elite_fraction": 0.2, "sync_period": 1, "redistribute": Even(late_only=True)}
         settings |= {"warmup_frames": 5_000, "horizon": Truncated(200)}
-        if overrides.get("learners") == ():  # evolution alone: nobody to share with or to ask
+        if not overrides.get("learners", True):  # evolution alone: nobody to share with or to ask
             settings |= {"share": None, "horizon": None}
         return cls(env, network or HYBRID_NETWORK, **evolving(BREEDER, settings, overrides))
 

@@ -5,8 +5,8 @@ hybrid-dense: four tasks of MuJoCo as they are. hybrid-late: the same, where the
 paid at the last step; beside the learner that sees returns as they are paid stands that of the
 preset, which sees them spread. Shared rewards are beyond-7-decoys.
 
-The preset was chosen on seeds from 1,000 on, with 100,000 to 300,000 frames of Hopper, HalfCheetah
-and Swimmer; reported runs have seeds from 0 on.
+The preset was chosen on seeds from 1,000 on, with up to 300,000 frames of the four tasks; reported
+runs have seeds from 0 on.
 """
 
 from collections.abc import Iterable, Sequence

@@ -11,7 +11,8 @@ so that their fitness is comparable; a member whose episode terminated before ha
 The value is discounted by the learner's γ, while returns are not: it stands for about 1/(1 - γ)
 further steps. Tests of champions and the learners' own episodes are whole ones, and so are all
 while no member was ever paid before the last step of an episode: what is cut off there is the whole
-return.
+return. Where some episodes are paid at their end alone and others before, a redistribution that is
+late_only still spreads the former for the critic, which then adds the rest of their return alone.
 
 Departures: they discount the H rewards too, use a value function that takes the policy as an input,
 and evaluate like this with some probability; here it is the learner's own critic, in every

@@ -106,7 +106,8 @@ class SAC(AbstractLearner):
     reward_scale: float | None = 1.0
     """Factor of all rewards that critics see, ≥ 0; None: as in TD3."""
     critics: int = eqx.field(static=True, default=2)  # number; the target is their minimum, ≥ 1
-    policy_delay: int = eqx.field(static=True, default=1)  # critic updates per actor update, ≥ 1
+    policy_delay: int = eqx.field(static=True, default=1)
+    """Updates of the critics per update of the actor and the temperature, at least 1."""
     batch_size: int = eqx.field(static=True, default=256)  # transitions per update, ≥ 1
     signal: str | None = eqx.field(static=True, default=None)
     """Name of the reward that it maximises; None: that of its algorithm."""
@@ -154,7 +155,7 @@ class SAC(AbstractLearner):
             # The temperature rises while the entropy -log_p is below its target.
             entropy = self.target_entropy * batch.action.shape[1]
             gradient, rate = -jnp.mean(log_p + entropy), (state.alpha_opt, self.alpha_lr)
-            # Counted for the updates without one too, so that means over updates are right.
+            # Counted for the updates without one too, so that means over many updates are right.
             return actor, opt, *adam(state.log_alpha, gradient, *rate), self.policy_delay * loss
 
         before = (state.actor, state.actor_opt, state.log_alpha, state.alpha_opt, jnp.float32(0.0))

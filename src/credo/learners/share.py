@@ -19,8 +19,8 @@ class AbstractShare(eqx.Module):
     """The learners' share of all frames, from generation to generation."""
 
     until: eqx.AbstractVar[float | None]
-    """Frames of the run after which a generation has one round of the learners; None: none. A run
-    puts its budget here."""
+    """Frames of the run after which a generation has one round of the learners; None: none. It must
+    be a field: a run puts its budget here where that is less."""
 
     @property
     @abc.abstractmethod
@@ -47,6 +47,7 @@ class Fixed(AbstractShare):
 
     def __check_init__(self):
         require.within("learners", self.learners, 0, 0.99)
+        require.at_least("until", self.until, 0)
 
     @property
     def most(self) -> float:
@@ -73,6 +74,7 @@ class Earned(AbstractShare):
         require.within("most", self.most, 0, 0.99)
         require.within("least", self.least, 0, self.most)
         require.within("memory", self.memory, 0, 1)
+        require.at_least("until", self.until, 0)
 
     def first(self) -> float:
         return 0.5 * (self.least + self.most)
@@ -81,4 +83,5 @@ class Earned(AbstractShare):
         best = jnp.max(fitness, initial=-jnp.inf, where=guests)
         better = jnp.sum((fitness > best) & ~guests)
         aim = self.least + (self.most - self.least) * jnp.exp2(-better.astype(jnp.float32))
-        return jnp.where(jnp.any(guests), share + self.memory * (aim - share), share)
+        told = jnp.any(guests) & jnp.any(fitness > -jnp.inf)
+        return jnp.where(told, share + self.memory * (aim - share), share)

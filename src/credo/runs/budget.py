@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ..learners.share import AbstractShare
 from .options import RunOptions
 from .record import RunError
 
@@ -109,9 +110,10 @@ def limited(algorithm: Any, budget: Budget) -> Any:
     """`algorithm` whose learners have their share of frames until the budget is spent: their rounds
     alone may be a sixth of it. What is recorded stays what the user said."""
     share = getattr(algorithm, "share", None)
-    if share is None or share.until is not None or budget.frames is None:
+    if not isinstance(share, AbstractShare) or budget.frames is None:
         return algorithm
-    share = dataclasses.replace(share, until=float(budget.frames))
+    until = min(float(budget.frames), np.inf if share.until is None else share.until)
+    share = dataclasses.replace(share, until=until)
     return dataclasses.replace(algorithm, share=share)
 
 

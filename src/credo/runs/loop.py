@@ -133,7 +133,8 @@ def resume(
 
     The result has the same bits as that of a run never stopped (same machine and core count).
     A new budget takes the place of the whole old one: with `generations` alone a limit of frames
-    is dropped, and the other way round; without `stop_at` that is dropped too.
+    is dropped, and the other way round; without `stop_at` that is dropped too. The generation that
+    an old budget of frames cut short (learners with a `share`) stays as it is.
 
     **Arguments:**
 
