@@ -33,7 +33,7 @@ def erl(learners, **fields):
 
 
 def cerl():
-    fields = {"learners": (TD, SHORT), "workers": 2, "test_every": 1, "updates_per_frame": 0.125}
+    fields = {"learners": (TD, SHORT), "workers": 2, "test_every": 1, "updates_per_frame": 0.25}
     return ERL.cerl(LOCK, NETWORK, **HYBRID | fields)
 
 
