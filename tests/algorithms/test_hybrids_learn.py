@@ -1,7 +1,7 @@
 """Hybrids learn what neither of their parts does: `Locked`, whose best return is near 16.
 
 Evolution alone finds the lever and copies badly, a learner alone lets the lever go. The bounds
-were chosen on seeds 0, 1, 2, 7, 8 and 100: ERL 8.4 to 12.9, evolution -0.1 to 5.2.
+were chosen on seeds 2, 11, 12 and 13: ERL 11.8 to 12.6, CERL 11.7 to 12.8, evolution 1.1 to 6.4.
 """
 
 import dataclasses
@@ -33,18 +33,18 @@ def erl(learners, **fields):
 
 
 def cerl():
-    fields = {"learners": (TD, SHORT), "workers": 2, "test_every": 1, "updates_per_frame": 0.25}
+    fields = {"learners": (TD, SHORT), "workers": 2, "test_every": 1, "updates_per_frame": 0.5}
     return ERL.cerl(LOCK, NETWORK, **HYBRID | fields)
 
 
 def td3(learner, env=LOCK):
-    return OffPolicy.td3(env, NETWORK, learner=learner, updates_per_frame=0.25, **ALONE)
+    return OffPolicy.td3(env, NETWORK, learner=learner, updates_per_frame=0.5, **ALONE)
 
 
 METHODS = {  # who learns, and the return of the final champion: at least, at most
-    "ERL": (erl((TD,), updates_per_frame=0.25), 9.0, 16.0),
-    "CERL": (cerl(), 9.0, 16.0),
-    "evolution alone": (erl(()), -2.0, 7.5),
+    "ERL": (erl((TD,), updates_per_frame=0.5), 10.0, 16.0),
+    "CERL": (cerl(), 10.0, 16.0),
+    "evolution alone": (erl(()), -2.0, 8.0),
     "the learner alone": (td3(TD), -1.0, 0.5),
     "the other learner alone": (td3(SHORT), -1.0, 0.5),
     "the learner alone, no lock": (td3(TD, OPEN), 9.0, 16.0),  # it does learn to copy
@@ -54,10 +54,10 @@ METHODS = {  # who learns, and the return of the final champion: at least, at mo
 @pytest.mark.parametrize("method", METHODS)
 def test_hybrids_learn_what_neither_of_their_parts_does(method):
     algorithm, least, most = METHODS[method]
-    state, frames, generation = algorithm.init(key=jax.random.key(7)), 0, 0
+    state, frames, generation = algorithm.init(key=jax.random.key(3)), 0, 0
     metrics = {}
     while frames < FRAMES:
-        key = jax.random.fold_in(jax.random.key(7), generation)
+        key = jax.random.fold_in(jax.random.key(3), generation)
         state, metrics = algorithm.generation(state, key=key)
         frames, generation = frames + int(metrics["frames"]), generation + 1
     assert least <= float(metrics["champion_score"]) <= most

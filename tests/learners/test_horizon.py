@@ -14,8 +14,10 @@ from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy
 from credo.environments.wrappers import delayed
 from credo.evolution.breeder import draw
+from credo.learners.base import scaled
 from credo.learners.credit import Even
 from credo.learners.horizon import Truncated
+from credo.learners.share import Fixed
 from credo.learners.td3 import TD3
 from credo.networks.mlp import MLP, Critic
 from credo.rollout import collect
@@ -99,12 +101,33 @@ def test_the_population_plays_less_and_learners_play_on(played):
     np.testing.assert_allclose(whole.returns["reward"], plain.returns["reward"], rtol=1e-6)
 
 
-def test_a_learner_that_scales_rewards_sees_the_buffer_that_is_there(played):
-    """Outside one large program the old buffer is gone once the new one is made."""
+def test_a_learner_that_scales_rewards_asks_by_the_scale_it_learned_with(played):
+    """That of the buffer before this generation, which is gone once the new one is made."""
     erl, state = played
-    scaling = replace(erl, learners=(replace(LEARNER, reward_scale=None),))
-    _, ahead = play_ahead(scaling, kept(state), state.population, 1, key=jax.random.key(5))
-    assert np.isfinite(ahead.returns["reward"]).all()
+    given = (state.population, 1)
+    learner = replace(LEARNER, reward_scale=None)
+    by_hand = scaled(learner, state.replay, "reward")
+    ahead = [
+        play_ahead(replace(erl, learners=(one,)), kept(state), *given, key=jax.random.key(5))[1]
+        for one in (learner, by_hand, replace(LEARNER, reward_scale=1.0))
+    ]
+    one, same, other = (np.asarray(x.returns["reward"]) for x in ahead)
+    np.testing.assert_allclose(one, same, rtol=1e-5)
+    assert not np.allclose(one, other, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "env", [Copy(), Gymnasium("InvertedPendulum-v5", in_process=True)], ids=["JAX", "Gymnasium"]
+)
+def test_late_rewards_alone_may_be_spread_where_episodes_are_cut(env):
+    fields = {"learners": (LEARNER,), "horizon": Truncated(3), "share": Fixed(0.1), **SMALL}
+    erl = ERL.erl(env, NETWORK, redistribute=Even(late_only=True), episodes=1, **fields)
+    state = erl.init(key=jax.random.key(0))
+    assert bool(state.late)
+    state, _ = erl.generation(state, key=jax.random.key(1))
+    assert not bool(state.late)  # it pays at every step
+    _, ahead = play_ahead(erl, state, state.population, 1, key=jax.random.key(2))
+    assert np.all(np.asarray(ahead.steps) == 3)
 
 
 def test_episodes_are_whole_where_all_is_paid_at_their_last_step():

@@ -273,8 +273,8 @@ def teach(hybrid: Hybrid, state: HybridState, frames: Frames, *, keys: tuple[Key
 
 def _until_shared(hybrid: Hybrid, state: HybridState, metrics: Metrics, frames: Frames, *, keys):
     """`teach` from its second round on."""
+    assert hybrid.share is not None
     wanted = state.share / (1.0 - state.share) * frames.astype(jnp.float32)
-
     until = jnp.inf if hybrid.share.until is None else hybrid.share.until
 
     def due(loop) -> Bool[Array, ""]:

@@ -147,6 +147,11 @@ def adam_state(weights: PyTree) -> optax.OptState:
     return optax.adam(0.0).init(eqx.filter(weights, eqx.is_inexact_array))
 
 
+def adam_steps(state: optax.OptState) -> Int[Array, ""]:
+    """How many steps of `adam` a state has behind it."""
+    return optax.tree.get(state, "count")
+
+
 def descend(loss: Callable[..., Any], given, state, rate, max_norm=None) -> tuple[Any, Any, Any]:
     """One step of `adam` down the gradient of `loss(*given)` by its first argument, the weights.
 

@@ -26,7 +26,18 @@ from ..networks.mlp import (
 )
 from ..networks.values import Histogram
 from ..types import Batch, Metrics
-from .base import AbstractLearner, Returns, Value, act, adam, adam_state, bellman, descend, polyak
+from .base import (
+    AbstractLearner,
+    Returns,
+    Value,
+    act,
+    adam,
+    adam_state,
+    adam_steps,
+    bellman,
+    descend,
+    polyak,
+)
 
 HYBRID_NETWORK = MLP(hidden=(256, 256), activation="tanh", initializer="uniform")
 """An actor for mutation as well as for gradients: weights of a tanh network change what it does
@@ -159,7 +170,7 @@ class SAC(AbstractLearner):
             return actor, opt, *adam(state.log_alpha, gradient, *rate), self.policy_delay * loss
 
         before = (state.actor, state.actor_opt, state.log_alpha, state.alpha_opt, jnp.float32(0.0))
-        due = state.critic_opt[0].count % self.policy_delay == 0
+        due = adam_steps(state.critic_opt) % self.policy_delay == 0
         after = jax.lax.cond(due, moved, lambda: before) if self.policy_delay > 1 else moved()
         actor, actor_opt, log_alpha, alpha_opt, actor_loss = after
         targets = polyak(state.target_critics, critics, self.tau)
