@@ -194,7 +194,10 @@ def require_critic(asked: Any, learners: tuple[AbstractLearner, ...]) -> None:
     """Raise unless the first learner can say what other policies are worth."""
     name = type(asked).__name__
     if not learners:
-        raise ValueError(f"{name} asks a learner's critic, and there is no learner: give learners")
+        raise ValueError(
+            f"{name} asks a learner's critic, and there is no learner: give learners, or None in "
+            f"place of {name}"
+        )
     if type(learners[0]).value is AbstractLearner.value:
         raise ValueError(
             f"{name} asks the critic of the first learner, and {type(learners[0]).__name__} has no "
