@@ -1,5 +1,10 @@
-"""When does a hybrid win: the table that says it."""
+"""When does a hybrid win: the table that says it; and its ingredients."""
 
+from collections import defaultdict
+
+import pytest
+
+from credo.experiments import ingredients
 from credo.experiments.hybrids import EVOLUTION, HYBRID, IMPROVEMENT, LEARNER, improvement
 from credo.report.rows import Results, Row
 
@@ -20,3 +25,14 @@ def test_the_hybrid_stands_beside_each_of_its_parts():
     assert learner[4] == "0.00 to 1.00"
     # A ratio to a negative mean says nothing.
     assert evolution == ["Hopper-v5", EVOLUTION, None, "1.00", "1.00 to 1.00"]
+
+
+@pytest.mark.parametrize("name", ["hybrid-learner", "hybrid-ingredients"])
+def test_every_ingredient_changes_the_algorithm_and_no_two_are_the_same(name):
+    tasks = defaultdict(dict)
+    for cell in ingredients.EXPERIMENTS[name].cells("full"):
+        tasks[cell.labels["task"]][cell.labels["change"]] = cell.algorithm
+    assert len(tasks) == 2
+    for algorithms in tasks.values():
+        assert next(iter(algorithms)) == ingredients.WHOLE
+        assert len({repr(x) for x in algorithms.values()}) == len(algorithms) > 10

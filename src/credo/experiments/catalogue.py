@@ -47,6 +47,8 @@ EXPERIMENTS = {
     "beyond-7-critics": "15 rovers from the team's reward alone, fitness critics",
     "hybrid-dense": "when does a hybrid win? Rewards at every step",
     "hybrid-late": "when does a hybrid win? The return at the last step",
+    "hybrid-learner": "the hybrid's learner, one ingredient changed at a time",
+    "hybrid-ingredients": "the hybrid, one ingredient changed at a time",
     "check-spread": "MADDPG and MATD3 on simple_spread",
 }
 
@@ -69,6 +71,7 @@ MODULES = {  # of this folder, with the experiments that each has
     "decoys": ("beyond-7-decoys", "beyond-7-critics"),
     "paths": ("fig-7.5",),
     "hybrids": ("hybrid-dense", "hybrid-late"),
+    "ingredients": ("hybrid-learner", "hybrid-ingredients"),
     "check_spread": ("check-spread",),
 }
 
