@@ -294,3 +294,21 @@ def test_short_numbers_of_the_ticks():
     form = axes.xaxis.get_major_formatter()
     values = (0.0, 950.0, 20_000.0, -1_500.0, 1e6, 2.5e9)
     assert [form(v) for v in values] == ["0", "950", "20k", "−1.5k", "1M", "2.5G"]
+
+
+def test_side_by_side_a_method_looks_the_same_and_is_named_once():
+    left = figure(
+        curves=[Curve("hybrid", [1, 2], [[0, 1]]), Curve("its learner", [1, 2], [[1, 0]])]
+    )
+    right = figure(curves=[Curve("its learner", [1, 2], [[2, 0]]), Curve("ea", [1, 2], [[3, 0]])])
+    with matplotlib.rc_context(styles.LIGHT.rc):
+        canvas = figures.side_by_side([left, right], ["dense", "late"], styles.LIGHT)
+        canvas.draw_without_rendering()
+    named = [text.get_text() for text in canvas.legends[0].get_texts()]
+    assert named == ["hybrid", "its learner", "ea"]
+    colours = [
+        {line.get_label(): line.get_color() for line in axes.lines if line.get_label() in named}
+        for axes in canvas.axes
+    ]
+    assert colours[0]["its learner"] == colours[1]["its learner"] != colours[1]["ea"]
+    assert [axes.get_title() for axes in canvas.axes] == ["dense", "late"]

@@ -255,6 +255,26 @@ def draw(figure: Plot, theme: Theme, looks: Looks | None = None, legend: bool = 
     return canvas
 
 
+def side_by_side(figures: Sequence[Figure], titles: Sequence[str], theme: Theme) -> Canvas:
+    """Several figures with one legend, for a README or a paper; a curve looks the same in all.
+    Their levels have no names. To be called with the theme's settings of matplotlib."""
+    canvas = Canvas(figsize=(3.0 * len(figures), 2.4), layout="constrained")
+    FigureCanvasAgg(canvas)
+    looks = assign(curve.label for figure in figures for curve in figure.curves)
+    legend: dict[str, Line2D] = {}
+    panels = canvas.subplots(1, len(figures), squeeze=False)[0]
+    for axes, figure, title in zip(panels, figures, titles, strict=True):
+        axes.set_title(title)
+        axes.set_xlabel(figure.x_label)
+        for curve, line in zip(
+            figure.curves, draw_curves(canvas, axes, figure, theme, looks), strict=True
+        ):
+            legend.setdefault(curve.label, line)
+    panels[0].set_ylabel(figures[0].y_label)
+    add_legend(canvas, list(legend.values()))
+    return canvas
+
+
 def draw_curves(
     canvas: Canvas, axes: Axes, figure: Figure, theme: Theme, looks: Looks | None
 ) -> list[Line2D]:

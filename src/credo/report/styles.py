@@ -83,6 +83,7 @@ METHODS = {
     name: Look(color, dash) for dash, row in enumerate(_GRID) for color, name in enumerate(row)
 }
 ALIASES = {"gradient": "bptt", "evolution": "neuroevolution", "ff": "mlp", "feed": "mlp"}
+ALIASES |= {"hybrid": "erl", "learner": "sac"}
 
 
 def method(label: str) -> str | None:
