@@ -9,19 +9,15 @@ The preset was chosen on seeds from 1,000 on, with up to 300,000 frames of the f
 runs have seeds from 0 on.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
-
-import numpy as np
 
 from ..algorithms.erl import ERL
 from ..algorithms.off_policy import OffPolicy
-from ..analysis import statistics
-from ..report import sections as page
-from ..report.rows import Results
-from .base import Cell, Experiment, Value
+from .base import Cell, Experiment
 from .mujoco import MEASURES, STAND_IN, TABLE, cell, curves
 from .plans import Plan
+from .views import Improvement
 
 TASKS = ("Swimmer-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
 HYBRID, LEARNER, EVOLUTION = "hybrid", "its learner alone", "its evolution alone"
@@ -61,43 +57,15 @@ def late(budget: str) -> list[Cell]:
     ]
 
 
-IMPROVEMENT = ("task", "beside", "ratio of means", "P(hybrid is better)", "95 % interval")
-
-
-def improvement(results: Results, values: Sequence[Value]) -> Iterable[page.Table]:
-    """The hybrid against each of the others: the ratio of mean returns, and the probability that a
-    run of it is better than a run of the other, with an interval."""
-    body = []
-    for task in results.levels("task"):
-        here = results.where(task=task)
-        scores = {x: _of_runs(here, x) for x in here.levels("method")}
-        for other in scores:
-            if other != HYBRID and HYBRID in scores:
-                body.append([task, other, *_against(scores[HYBRID], scores[other])])
-    if body:
-        caption = (
-            "Final champions, means over 10 fresh episodes of each run. The probability is that a "
-            "run of the hybrid is better than one of the other (Agarwal et al. 2021); its interval "
-            "is from 10,000 bootstrap samples of the runs of both, and wide with few runs."
-        )
-        yield page.Table("Is the hybrid better than its parts?", [*IMPROVEMENT], body, caption)
-
-
-def _of_runs(results: Results, method: str) -> np.ndarray:
-    """The mean return of the final champion of each run."""
-    found = results.where(method=method).by_seed("return")
-    return np.array([np.mean(x) for seed, x in found.items() if seed is not None], np.float64)
-
-
-def _against(ours: np.ndarray, theirs: np.ndarray) -> list[page.Cell]:
-    ratio = f"{ours.mean() / theirs.mean():.2f}" if theirs.mean() > 0 else None
-    low, high = statistics.improvement_interval(ours, theirs)
-    chance = statistics.probability_of_improvement(ours, theirs)
-    return [ratio, f"{chance:.2f}", f"{low:.2f} to {high:.2f}" if np.isfinite(low) else None]
-
-
+BETTER = Improvement(
+    HYBRID,
+    "return",
+    ["task"],
+    "Is the hybrid better than its parts?",
+    caption="Final champions, means over 10 fresh episodes of each run.",
+)
 CURVES = curves()
-VIEWS = (CURVES, improvement, TABLE)
+VIEWS = (CURVES, BETTER, TABLE)
 EXPERIMENTS = {
     "hybrid-dense": Experiment(dense, MEASURES, VIEWS, DENSE),
     "hybrid-late": Experiment(late, MEASURES, VIEWS, LATE),

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ..analysis import statistics
 from ..report import sections as page
 from ..report.rows import Label, Labels, Results
 from .base import Value, named
@@ -256,6 +257,52 @@ class Curves:
         seeds = dict.fromkeys(seed for place in found for seed in place)
         runs = [[place.get(seed, np.nan) for place in found] for seed in seeds]
         return page.Curve(label, xs, runs)
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """A method against each of the others, in a row for each combination of the labels `rows`: the
+    ratio of the means of a metric over runs, and the probability that a run of it is better than
+    one of the other (Agarwal et al. 2021, "Deep RL at the Edge of the Statistical Precipice"), with
+    an interval."""
+
+    method: str
+    metric: str
+    rows: Sequence[str]
+    title: str
+    caption: str = ""
+
+    def __call__(self, results: Results, values: Sequence[Value]) -> Iterable[page.Table]:
+        body = []
+        for told, here in panels(results, self.rows):
+            runs = {x: self.runs(here, x) for x in here.levels("method")}
+            ours = runs.pop(self.method, np.array([]))
+            places = [label_text(x) for x in told.values()]
+            body += [
+                [*places, x, *against(ours, y)] for x, y in runs.items() if len(ours) and len(y)
+            ]
+        if body:
+            columns = [*self.rows, "beside", "ratio of means", f"P({self.method} is better)"]
+            caption = (
+                f"{self.caption} The probability is that a run of {self.method} is better than one "
+                "of the other (Agarwal et al. 2021); its interval is from 10,000 bootstrap samples "
+                "of the runs of both, and wide with few runs."
+            )
+            yield page.Table(self.title, [*columns, "95 % interval"], body, caption.strip())
+
+    def runs(self, results: Results, method: str) -> np.ndarray:
+        """The mean of each run."""
+        found = np.array(list(per_seed(results.where(method=method), self.metric).values()))
+        return found[np.isfinite(found)]
+
+
+def against(ours: np.ndarray, theirs: np.ndarray) -> list[page.Cell]:
+    """Ratio of means, if both have a sign that allows one, the probability of improvement, and its
+    interval, of values of runs."""
+    ratio = f"{ours.mean() / theirs.mean():.2f}" if theirs.mean() > 0 else None
+    low, high = statistics.improvement_interval(ours, theirs)
+    chance = statistics.probability_of_improvement(ours, theirs)
+    return [ratio, f"{chance:.2f}", f"{low:.2f} to {high:.2f}" if np.isfinite(low) else None]
 
 
 # --------------------------------------------------------------------------------------- helpers
