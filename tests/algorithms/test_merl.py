@@ -504,3 +504,12 @@ def test_the_preset_is_that_of_the_rover_domain():
     )
     assert (LOCAL.target_noise, LOCAL.target_noise_clip, LOCAL.policy_delay) == (0.2, 0.5, 2)
     assert MERL.merl(Meet(), NETWORK, workers=7).workers == 7
+
+
+def test_the_preset_for_teams_of_equals_differs_from_it_where_docs_say():
+    merl, hybrid = MERL.merl(Meet()), MERL.presets()["hybrid"](Meet())
+    changes = {"network": Team(sharing="everything"), "redistribute": Even(late_only=True)}
+    changes |= {"population_size": 50, "episodes": 3, "updates_per_frame": 0.2}
+    assert evolved(merl, **changes) == hybrid
+    assert MERL.hybrid(Meet(), NETWORK, episodes=7).episodes == 7
+    assert MERL.hybrid(Meet(), NETWORK).network == NETWORK
