@@ -12,6 +12,7 @@ from evolved import evolved
 
 from credo import rollout, tree
 from credo.algorithms.erl import ERL
+from credo.algorithms.hybrid import averaged
 from credo.algorithms.lineage import DRAWN, INJECTED
 from credo.algorithms.merl import BREEDER, LOCAL, MERL
 from credo.algorithms.neuroevolution import Neuroevolution
@@ -509,7 +510,25 @@ def test_the_preset_is_that_of_the_rover_domain():
 def test_the_preset_for_teams_of_equals_differs_from_it_where_docs_say():
     merl, hybrid = MERL.merl(Meet()), MERL.presets()["hybrid"](Meet())
     changes = {"network": Team(sharing="everything"), "redistribute": Even(late_only=True)}
-    changes |= {"population_size": 50, "episodes": 3, "updates_per_frame": 0.2}
+    changes |= {"population_size": 50, "episodes": 4, "updates_per_frame": 0.2, "remember": True}
+    changes |= {"learners": (dataclasses.replace(LOCAL, batch_size=32),)}
     assert evolved(merl, **changes) == hybrid
     assert MERL.hybrid(Meet(), NETWORK, episodes=7).episodes == 7
     assert MERL.hybrid(Meet(), NETWORK).network == NETWORK
+
+
+def test_teams_may_be_ranked_by_every_generation_that_they_lived_through():
+    algorithm = dataclasses.replace(ALGORITHM, remember=True)
+    start = jax.random.key(0)  # a generation uses up the state that it is given
+    after, _ = algorithm.generation(algorithm.init(key=start), key=jax.random.key(1))
+    elites = algorithm.elites
+    assert after.lineage.times.tolist() == [1.0] * elites + [0.0] * (K - elites)
+    forgetful, _ = ALGORITHM.generation(ALGORITHM.init(key=start), key=jax.random.key(1))
+    assert forgetful.lineage.times.tolist() == [0.0] * K
+    # One lucky generation does not put a newcomer above an elite that was better in two.
+    earned, times = jnp.zeros(K).at[0].set(9.0), jnp.zeros(K).at[0].set(1.0)
+    lineage = dataclasses.replace(after.lineage, earned=earned, times=times)
+    fitness = jnp.zeros(K).at[0].set(9.0).at[1].set(10.0)
+    _, average = averaged(algorithm, dataclasses.replace(after, lineage=lineage), fitness)
+    assert int(jnp.argmax(average)) == 0
+    assert int(jnp.argmax(averaged(ALGORITHM, after, fitness)[1])) == 1

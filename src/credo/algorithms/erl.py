@@ -52,7 +52,7 @@ from ..replay import Sampling
 from ..rollout import Environment
 from ..types import Metrics
 from .aid import coached, play_ahead, preselect
-from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
+from .hybrid import Hybrid, HybridState, averaged, balance, breed, inject, play, teach, tested
 
 TABLE_5_1 = {  # task: (ψ, ξ, ω)
     "HalfCheetah": (0.1, 1, 10),
@@ -193,15 +193,13 @@ class ERL(Hybrid):
         # 6-7: for actor in pop: fitness, R = Evaluate(actor, R, noise=None, ξ)
         playing = play if self.horizon is None else play_ahead
         state, played = playing(self, state, state.population, self.episodes, key=play_key)
-        fitness = average = jnp.mean(played.of(self.reward), axis=1)
+        fitness = jnp.mean(played.of(self.reward), axis=1)
 
         if self.share is not None:
             state = balance(self, state, fitness)
 
         # 8-15: rank, keep the elites, select, cross and mutate.
-        if self.remember:
-            lineage, average = state.lineage.averaged(fitness)
-            state = replace(state, lineage=lineage)
+        state, average = averaged(self, state, fitness)
         breeding = breed if self.surrogate is None else preselect
         state, bred = breeding(self, state, average, key=breed_key)
 

@@ -87,6 +87,7 @@ class Hybrid(eqx.Module):
     test_episodes: eqx.AbstractVar[int]
     test_every: eqx.AbstractVar[int]
     fitness: eqx.AbstractVar[str | None]
+    remember: eqx.AbstractVar[bool]
     normalize_observations: eqx.AbstractVar[bool]
 
     def __check_init__(self):
@@ -214,6 +215,15 @@ def _noted(how: AbstractRedistribution, state: HybridState, experience, played) 
     new = how.stored(experience, played)
     replay = extend(state.replay, new.transitions, new.valid)
     return replace(state, replay=replay, known=how.noted(state.known, replay, experience, played))
+
+
+def averaged(hybrid: Hybrid, state: HybridState, fitness: Fitness) -> tuple[HybridState, Fitness]:
+    """What members are ranked by: their fitness, or, if they `remember`, that of every generation
+    that they lived through."""
+    if not hybrid.remember:
+        return state, fitness
+    lineage, average = state.lineage.averaged(fitness)
+    return replace(state, lineage=lineage), average
 
 
 def breed(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key) -> Result:

@@ -49,7 +49,7 @@ from ..rollout import Environment
 from ..types import Metrics
 from .aid import coached, play_ahead, preselect
 from .erl import BREEDER as ERL_BREEDER
-from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
+from .hybrid import Hybrid, HybridState, averaged, balance, breed, inject, play, teach, tested
 
 LOCAL = TD3(signal="local", **TEAM)
 """The learner of the team: one twin critic that all agents share (lines 2 and 16-21)."""
@@ -91,6 +91,9 @@ class MERL(Hybrid):
     """Name of the reward that fitness sums up; None: the task\'s first."""
     redistribute: AbstractRedistribution | None = None
     """How learners are paid an episode's return where it comes late; None: as the task pays."""
+    remember: bool = eqx.field(static=True, default=False)
+    """Rank a team by the average fitness over all generations that it lived through, not by the
+    last one alone."""
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Policies see observations normalised by the running mean and variance of all observations so
     far; the champion keeps them."""
@@ -106,10 +109,12 @@ class MERL(Hybrid):
     @classmethod
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """One preset for teams of equals: one policy that all agents share, more teams that are
-        judged by fewer episodes, twice the updates, and late local rewards spread. Chosen on seeds
-        from 1000 on; docs, merl, say by what."""
-        settings: dict[str, Any] = {"population_size": 50, "episodes": 3, "updates_per_frame": 0.2}
-        settings |= {"redistribute": Even(late_only=True)}
+        judged by fewer episodes in each of the generations they live through, more and smaller
+        updates, and late local rewards spread. Chosen on seeds from 1000 on; docs, merl, say by
+        what."""
+        settings: dict[str, Any] = {"learners": (replace(LOCAL, batch_size=32),)}
+        settings |= {"population_size": 50, "episodes": 4, "remember": True}
+        settings |= {"updates_per_frame": 0.2, "redistribute": Even(late_only=True)}
         return cls.merl(env, network or Team(sharing="everything"), **settings | overrides)
 
     @classmethod
@@ -135,7 +140,8 @@ class MERL(Hybrid):
 
         # 10-14: rank, keep e elites, select k-e by tournament, cross with elites; and mutate.
         breeding = breed if self.surrogate is None else preselect
-        state, bred = breeding(self, state, fitness, key=breed_key)
+        state, average = averaged(self, state, fitness)
+        state, bred = breeding(self, state, average, key=breed_key)
 
         # 8: Rollout(π_pg, R, noise=W_g, ξ=1), in parallel worlds.
         # 15-21: for agent k: a minibatch from R^k; descend the critic's loss; follow the gradient

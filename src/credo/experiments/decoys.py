@@ -39,7 +39,7 @@ COUPLINGS = {"smoke": (3,), "quick": (3,)}
 PLANS = {
     "smoke": Plan(1_500, 2, 0.05),
     "quick": Plan(60_000, 2, 0.05),
-    "full": Plan(200_000, 3, 0.2),
+    "full": Plan(300_000, 3, 0.2),
 }
 FACTORED = "factoredness of the local reward"
 
@@ -47,7 +47,7 @@ FACTORED = "factoredness of the local reward"
 def decoys(budget: str) -> list[Cell]:
     """Every method at every share of misleading steps; those that never see the local reward at the
     ends of the dial, where they have the same numbers."""
-    dial = DIAL.get(budget, (0.0, 0.25, 0.45, 0.5, 0.75, 1.0))
+    dial = DIAL.get(budget, (0.0, 0.25, 0.45, 0.7, 1.0))
     return [
         planned({"method": method, "coupling": n, "mislead": share}, algorithm, plan, budget)
         for plan in [PLANS[budget]]
@@ -64,9 +64,11 @@ def of(method: str, env: Rover) -> Any:
     if method == HEADS:
         return build("merl", env)
     if method in (HYBRID, "ea"):
-        return MERL.hybrid(env, learners=() if method == "ea" else (LOCAL,))
-    env = dataclasses.replace(env, rewards=rewards(method))
-    return dataclasses.replace(build(method, env), network=ALIKE)
+        changes: dict[str, Any] = {"learners": ()} if method == "ea" else {}
+        return MERL.hybrid(env, **changes)
+    alone: Any = build(method, dataclasses.replace(env, rewards=rewards(method)))
+    learner = dataclasses.replace(alone.learner, batch_size=32)
+    return dataclasses.replace(alone, network=ALIKE, learner=learner)
 
 
 def agreement(env: Rover) -> dict[str, float]:
@@ -103,7 +105,7 @@ CRITIC_PLANS = {
     "full": Plan(2_000_000, 3, 0.01),
 }
 ALIKE = Team(sharing="everything")
-RETURN = dataclasses.replace(LOCAL, signal="global", reward_scale=50.0)
+RETURN = dataclasses.replace(LOCAL, batch_size=32, signal="global", reward_scale=50.0)
 """What an episode paid in all stands for a return of 1."""
 UNSHAPED: dict[str, dict[str, Any]] = {
     "ea": {"learners": ()},
