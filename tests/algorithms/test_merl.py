@@ -511,7 +511,7 @@ def test_the_preset_for_teams_of_equals_differs_from_it_where_docs_say():
     merl, hybrid = MERL.merl(Meet()), MERL.presets()["hybrid"](Meet())
     changes = {"network": Team(sharing="everything"), "redistribute": Even(late_only=True)}
     changes |= {"population_size": 50, "episodes": 4, "updates_per_frame": 0.2, "remember": True}
-    changes |= {"learners": (dataclasses.replace(LOCAL, batch_size=32),)}
+    changes |= {"learners": 3 * (dataclasses.replace(LOCAL, batch_size=32),)}
     assert evolved(merl, **changes) == hybrid
     assert MERL.hybrid(Meet(), NETWORK, episodes=7).episodes == 7
     assert MERL.hybrid(Meet(), NETWORK).network == NETWORK

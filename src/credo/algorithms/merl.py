@@ -109,10 +109,10 @@ class MERL(Hybrid):
     @classmethod
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """One preset for teams of equals: one policy that all agents share, more teams that are
-        judged by fewer episodes in each of the generations they live through, more and smaller
-        updates, and late local rewards spread. Chosen on seeds from 1000 on; docs, merl, say by
-        what."""
-        settings: dict[str, Any] = {"learners": (replace(LOCAL, batch_size=32),)}
+        judged by fewer episodes in each of the generations they live through, three learners that
+        differ by chance, smaller batches, and late local rewards spread. Chosen on seeds from 1000
+        on; docs, merl, say by what."""
+        settings: dict[str, Any] = {"learners": 3 * (replace(LOCAL, batch_size=32),)}
         settings |= {"population_size": 50, "episodes": 4, "remember": True}
         settings |= {"updates_per_frame": 0.2, "redistribute": Even(late_only=True)}
         return cls.merl(env, network or Team(sharing="everything"), **settings | overrides)

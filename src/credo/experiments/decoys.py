@@ -3,8 +3,9 @@
 beyond-7-decoys: near the rovers lie decoys, POIs of low value that one rover observes; farther away
 lie POIs of high value that need `coupling` rovers. A share of the local reward, the dial, pays a
 rover to stay beside a decoy that is not observed yet; the rest pays for coming closer to others.
-MERL by its preset `hybrid`, its learner alone, evolution alone and MATD3 with three rewards, all
-with one policy for all rovers, at equal frames and updates; and MERL as in Figure 7.4.
+MERL by its preset `hybrid`, one of its learners alone, its evolution alone and MATD3 with three
+rewards, all with one policy for all rovers, at equal frames and as many updates as MERL's three
+learners make together.
 
 beyond-7-critics: 15 rovers, four POIs worth 1, 2, 3 and 4 that need four rovers each, paid by the
 global reward alone: CCEA with and without a fitness critic (published, Rockefeller et al. 2020: a
@@ -32,14 +33,13 @@ from .views import Curves, Improvement, Table, known
 
 HYBRID = "merl"
 METHODS = (HYBRID, "ea", "td3 local", "matd3 local", "matd3 mixed", "matd3 global")
-HEADS = "merl, heads"
 BLIND = ("ea", "matd3 global")  # to the local reward
 DIAL = {"smoke": (0.5,), "quick": (0.0, 0.5)}
 COUPLINGS = {"smoke": (3,), "quick": (3,)}
 PLANS = {
     "smoke": Plan(1_500, 2, 0.05),
     "quick": Plan(60_000, 2, 0.05),
-    "full": Plan(300_000, 3, 0.2),
+    "full": Plan(200_000, 3, 0.2),
 }
 FACTORED = "factoredness of the local reward"
 
@@ -47,28 +47,28 @@ FACTORED = "factoredness of the local reward"
 def decoys(budget: str) -> list[Cell]:
     """Every method at every share of misleading steps; those that never see the local reward at the
     ends of the dial, where they have the same numbers."""
-    dial = DIAL.get(budget, (0.0, 0.25, 0.45, 0.7, 1.0))
+    dial = DIAL.get(budget, (0.0, 0.3, 0.6, 0.8))
     return [
         planned({"method": method, "coupling": n, "mislead": share}, algorithm, plan, budget)
-        for plan in [PLANS[budget]]
         for n in COUPLINGS.get(budget, (3, 4))
         for share in dial
-        for method in (*METHODS, HEADS)
+        for method in METHODS
         if method not in BLIND or share in (dial[0], dial[-1])
-        for algorithm in [of(method, Rover.misleading(n, share))]
+        for algorithm, plan in [of(method, Rover.misleading(n, share), PLANS[budget])]
     ]
 
 
-def of(method: str, env: Rover) -> Any:
-    """A method, with one policy for all rovers unless it has heads."""
-    if method == HEADS:
-        return build("merl", env)
+def of(method: str, env: Rover, plan: Plan) -> tuple[Any, Plan]:
+    """A method with one policy for all rovers, and its plan."""
     if method in (HYBRID, "ea"):
         changes: dict[str, Any] = {"learners": ()} if method == "ea" else {}
-        return MERL.hybrid(env, **changes)
+        return MERL.hybrid(env, **changes), plan
     alone: Any = build(method, dataclasses.replace(env, rewards=rewards(method)))
-    learner = dataclasses.replace(alone.learner, batch_size=32)
-    return dataclasses.replace(alone, network=ALIKE, learner=learner)
+    learners = MERL.hybrid(env).learners
+    learner = dataclasses.replace(alone.learner, batch_size=learners[0].batch_size)
+    as_many = round(plan.updates_per_frame * len(learners), 9)
+    alone = dataclasses.replace(alone, network=ALIKE, learner=learner)
+    return alone, plan._replace(updates_per_frame=as_many)
 
 
 def agreement(env: Rover) -> dict[str, float]:
@@ -110,9 +110,9 @@ RETURN = dataclasses.replace(LOCAL, batch_size=32, signal="global", reward_scale
 UNSHAPED: dict[str, dict[str, Any]] = {
     "ea": {"learners": ()},
     "ea, heads": {"learners": (), "network": Team()},
-    "merl, return spread": {"learners": (RETURN,)},
+    "merl, return spread": {"learners": 3 * (RETURN,)},
     "merl, fitness critic": {
-        "learners": (Criticised(RETURN),),  # pyright: ignore[reportCallIssue]
+        "learners": 3 * (Criticised(RETURN),),  # pyright: ignore[reportCallIssue]
     },
 }
 

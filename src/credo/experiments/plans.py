@@ -28,7 +28,6 @@ can happen within the 600 to 1,500 frames of a smoke run."""
 TEAM_FIELDS = {
     "replay_capacity": 5_000,
     "population_size": 5,
-    "workers": 2,
     "warmup_frames": 100,
     "start_frames": 100,
     "test_every": 300,
@@ -70,6 +69,7 @@ def shrunk(algorithm: Any) -> Any:
     fields: dict[str, Any] = dict(FIELDS)
     if isinstance(network, Team):
         fields |= TEAM_FIELDS | {"episodes": 1 if evolves else 2}
+        fields["workers"] = max(2, len(algorithm.learners) if evolves else 0)
         fields["network"] = dataclasses.replace(network, trunk=(8,) if network.trunk else ())
     else:
         fields["network"] = dataclasses.replace(network, hidden=(8,))
