@@ -55,6 +55,7 @@ LEARNER: dict[str, dict[str, Any]] = {  # fields of `OffPolicy.hybrid` that chan
     "with temperature 1 at first": sac(temperature=1.0),
     "with batches of 256, an actor that always moves": sac(batch_size=256, policy_delay=1),
     "with quantiles": sac(critic=critic(values=Quantiles())),
+    "with targets that follow at once": sac(tau=1.0),
     "with a residual critic": sac(critic=ResidualCritic(values=Histogram())),
     "with returns of 3 steps": {"sampling": Sampling(steps=3)},
     "with age that counts": {"sampling": Sampling(half_life=100_000)},
