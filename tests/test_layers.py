@@ -9,6 +9,7 @@ ROOT = pathlib.Path(credo.__file__).parent
 LEVELS = [
     {"types", "tree", "compilation", "require", "memory", "runner", "fields"},
     {"environments", "networks"},
+    {"playing"},
     {"rollout", "replay"},
     {"normalization"},
     {"evolution", "learners"},

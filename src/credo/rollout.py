@@ -4,8 +4,6 @@ There are two ways in. A population plays for its returns: `evaluate`, and `coll
 keeps the transitions. One policy is looked at: `record` keeps an episode of it, moment by moment.
 """
 
-import dataclasses
-import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -16,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from . import tree
+from . import playing, tree
 from .compilation import float32, jit
 from .environments.base import AbstractEnvironment, AbstractSequenceTask, correct
 from .environments.host import AbstractHostEnvironment, EnvironmentFailure, Episodes, sound
 from .environments.wrappers import Given
 from .networks.base import AbstractPolicy
+from .playing import acted, each, players, started, world_keys
 from .types import Evaluation, Sequence, Trace, Transition, plain
 
 Environment = AbstractEnvironment | AbstractHostEnvironment
@@ -181,13 +180,6 @@ def blank(env: Environment) -> Transition:
     return Transition(obs, action, rewards, obs, ended, jnp.bool_(False), active)
 
 
-def world_keys(pop: int, episodes: int, common: bool, *, key: PRNGKeyArray) -> PRNGKeyArray:
-    """A key per member and episode: what happens in the world, whoever acts."""
-    if common:
-        return jnp.broadcast_to(jax.random.split(key, episodes), (pop, episodes))
-    return jax.random.split(key, (pop, episodes))
-
-
 @jit
 def _lanes(population: PyTree, episodes: int, common: bool, *, key: PRNGKeyArray) -> PyTree:
     """Policies, and for each episode of each the key of its world and that of the policy."""
@@ -206,7 +198,7 @@ def _answer(
     world_key, _ = jax.random.split(key)
     keys = world_keys(1 if common else tree.size(population), episodes, common, key=world_key)
     # An episode resets with the first half of its world key: the same sequences either way.
-    sequences = _each(lambda key: env.sample(key=jax.random.split(key)[0]))(keys)
+    sequences = each(lambda key: env.sample(key=jax.random.split(key)[0]))(keys)
     return _answer_these(env, population, sequences)
 
 
@@ -226,10 +218,10 @@ def _play(
     None."""
     population, worlds, policy_keys = lanes
     lanes = worlds.shape
-    reset_keys, step_keys = jnp.moveaxis(_each(jax.random.split)(worlds), 2, 0)
-    states, first = _each(lambda key: env.reset(key=key))(reset_keys)
+    reset_keys, step_keys = jnp.moveaxis(each(jax.random.split)(worlds), 2, 0)
+    states, first = each(lambda key: env.reset(key=key))(reset_keys)
     population = eqx.filter_vmap(lambda policy: policy.arranged())(population)
-    carries = _start(population, policy_keys)
+    carries = started(population, policy_keys)
     active = jnp.broadcast_to(jnp.arange(lanes[1]) < wanted, lanes)
     # Where policy or world said NaN the episode goes on, has a return of NaN, and is forgotten.
     lost = active & ~_sound(first.obs)
@@ -246,12 +238,12 @@ def _play(
 
     def advance(loop):
         t, states, (obs, acting), carries, active, (returns, steps, lost), rows = loop
-        actions, carries = _act(population, obs, carries)
+        actions, carries = acted(population, obs, carries)
         sound = _sound(actions)
         actions = jnp.where(jnp.isfinite(actions), actions, 0.0)
-        keys = _each(lambda key: jax.random.fold_in(key, t))(step_keys)
+        keys = each(lambda key: jax.random.fold_in(key, t))(step_keys)
         bounded = jnp.clip(actions, -1.0, 1.0)
-        states, step = _each(lambda s, a, key: env.step(s, a, key=key))(states, bounded, keys)
+        states, step = each(lambda s, a, key: env.step(s, a, key=key))(states, bounded, keys)
         step = step if limit is None else step.cut(t + 1 >= limit)
         for x in jax.tree.leaves((step.obs, step.rewards)):
             sound = sound & _sound(x)
@@ -316,14 +308,15 @@ def _record(env: AbstractEnvironment, policy: AbstractPolicy, *, key: PRNGKeyArr
 def _record_on_host(
     env: AbstractHostEnvironment, policy: AbstractPolicy, seed: int | None, see: See, *, key
 ) -> Trace:
-    form, arrays = _apart(tree.single(policy))
-    drawn, carry = _start_on_host(form, arrays, (1, 1), True, key)
+    form, arrays = playing.apart(tree.single(policy))
+    drawn, keys = playing.draw((1, 1), True, key)
+    carry = playing.start(form, arrays, keys)
     seeds = np.array([np.asarray(drawn).item() if seed is None else seed], np.uint32)
     told, carries = Episodes(env, 1, True), [carry]
     obs = told.begin(seeds, np.ones(1, bool))
     see(not told.ongoing)
     while told.ongoing:
-        action, carry = _act_on_host(form, arrays, obs, carry)
+        action, carry = playing.act(form, arrays, obs, carry)
         obs = told.advance(np.asarray(action))
         carries.append(carry)
         see(not told.ongoing)
@@ -351,78 +344,13 @@ def _play_on_host(
 ) -> tuple[Evaluation, Any]:
     """The same with copies outside JAX: actions go there and time steps come back, once per step
     for all lanes together."""
-    pop = tree.size(population)
-    form, arrays = _apart(population)
-    seeds, first = _start_on_host(form, arrays, (pop, episodes), common, key)
-    told = Episodes(env, pop * episodes, record, limit)
-    for turn in env.turns(np.tile(np.arange(episodes) < int(wanted), pop)):
-        obs, carry = told.begin(np.asarray(seeds).reshape(-1), turn), first
-        while told.ongoing:
-            action, carry = _act_on_host(form, arrays, obs, carry)
-            obs = told.advance(np.asarray(action))
-    sums = jax.tree.map(
-        lambda x: jnp.asarray(x.reshape(pop, episodes, *x.shape[1:])), (told.returns(), told.steps)
-    )
-    if not record:
-        return Evaluation(*sums), None
-    return Evaluation(*sums), Experience(Transition(*told.rows()), None)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Form:
-    """A population without its arrays: what a program is compiled for. `equinox.filter_jit` would
-    look at every leaf anew at every step, which takes longer than the step."""
-
-    structure: Any
-    rest: tuple[Any, ...]
-
-    def filled(self, arrays: list[Array | None]) -> PyTree:
-        """The population again."""
-        leaves = [x if y is None else y for x, y in zip(arrays, self.rest, strict=True)]
-        return jax.tree.unflatten(self.structure, leaves)
-
-
-def _apart(population: PyTree) -> tuple[_Form, list[Array | None]]:
-    """A population as its form and its arrays."""
-    leaves, structure = jax.tree.flatten(population)
-    arrays = [x if eqx.is_array(x) else None for x in leaves]
-    return _Form(structure, tuple(None if eqx.is_array(x) else x for x in leaves)), arrays
-
-
-@functools.partial(jax.jit, static_argnums=(0, 2, 3))
-def _start_on_host(form: _Form, arrays, shape: tuple[int, int], common: bool, key: PRNGKeyArray):
-    """Seeds of the worlds, and the carries of all lanes `shape`."""
-    world_key, policy_key = jax.random.split(key)
-    seeds = _each(jax.random.bits)(world_keys(*shape, common, key=world_key))
-    return seeds, _start(form.filled(arrays), jax.random.split(policy_key, shape))
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _act_on_host(form: _Form, arrays, obs: Array, carry: PyTree):
-    """Actions, one lane behind the other, and carries."""
-    pop = next(x.shape[0] for x in arrays if x is not None)
-    obs = obs.reshape(pop, -1, *obs.shape[1:]).astype(jnp.float32)
-    actions, carry = _act(form.filled(arrays), obs, carry)
-    return actions.reshape(-1, *actions.shape[2:]), carry
-
-
-def _each(function):
-    """`function` of one lane for lanes `[pop, episodes]`."""
-    return jax.vmap(jax.vmap(function))
-
-
-def _start(population: PyTree, keys: PRNGKeyArray) -> PyTree:
-    """Carries of all lanes; keys `[pop, episodes]`."""
-    return eqx.filter_vmap(lambda p, keys: jax.vmap(lambda key: p.start(key=key))(keys))(
-        population, keys
-    )
-
-
-def _act(population: PyTree, obs: Float[Array, "pop episodes obs"], carries: PyTree):
-    """Actions and carries of all lanes."""
-    return eqx.filter_vmap(
-        lambda p, obs, carries: jax.vmap(lambda x, carry: p(x, carry))(obs, carries)
-    )(population, obs, carries)
+    drawn = playing.draw((tree.size(population), episodes), common, key)
+    worlds, policies = map(np.asarray, drawn)
+    limit = None if limit is None else int(limit)
+    part = playing.Part(env, population, worlds, policies, int(wanted), record, limit)
+    came = players.played(part)
+    played = Evaluation(*jax.tree.map(jnp.asarray, (came.returns, came.steps)))
+    return played, None if came.rows is None else Experience(Transition(*came.rows), None)
 
 
 def _answer_these(

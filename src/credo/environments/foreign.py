@@ -12,6 +12,7 @@ import sys
 import threading
 import warnings
 import weakref
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -177,6 +178,64 @@ def _level_of_user() -> int:
     return level
 
 
+class Tally:
+    """How the last 100 episodes of a task ended in this thread: "", or why one failed. `elsewhere`:
+    another process judges them, and is told all of the `news`."""
+
+    def __init__(self, env: AbstractForeignEnvironment, elsewhere: bool = False):
+        self._env, self._elsewhere = env, elsewhere
+        self._recent: collections.deque[str] = collections.deque(maxlen=100)
+        self._discarded = 0  # episodes so far
+        self.news: list[str] = []
+
+    @property
+    def failures(self) -> int:
+        """How many of the last 100 episodes have failed."""
+        return sum(map(bool, self._recent))
+
+    def add(self, endings: Sequence[str]) -> None:
+        """Note how some episodes ended."""
+        if self._elsewhere:
+            self.news += endings
+            return
+        for why in endings:
+            self._recent.append(why)
+            if why:
+                self._discarded += 1
+                self._say(why)
+
+    def check(self, playing: int = 0) -> None:
+        """Raise `EnvironmentFailure` if too many have failed, where so many are still `playing`."""
+        failures, recent = self.failures, min(len(self._recent) + playing, 100)
+        most = self._env.tolerated
+        if failures > most * recent and (failures >= 3 or most == 0):
+            first = next(filter(None, self._recent))
+            self._recent.clear()  # whoever goes on after this begins to count anew
+            count = f" ({failures} of {recent} episodes failed)" if failures > 1 else ""
+            raise EnvironmentFailure(f"{first}{count}")
+
+    def _say(self, why: str) -> None:
+        """The first, tenth, hundredth … failure, on the error stream."""
+        if self._env.tolerated and math.log10(self._discarded).is_integer():
+            with contextlib.suppress(OSError, ValueError):  # it is not read any more
+                print(
+                    f"credo: {self._discarded:,} episode{'s' * (self._discarded > 1)} failed and "
+                    f"left out, now: {why}. The run ends if more than {self._env.tolerated:.0%} of "
+                    "the last 100 fail (--tolerated)",
+                    file=sys.stderr,
+                )
+
+
+def tally(env: AbstractForeignEnvironment) -> Tally:
+    """That of a task in this thread."""
+    return _OPEN.tallies.setdefault(env, Tally(env, _OPEN.elsewhere))
+
+
+def judged_elsewhere() -> None:
+    """From now on failures are counted by who asked for episodes, not in this thread."""
+    _OPEN.elsewhere = True
+
+
 class ForeignCopies(AbstractCopies):
     """`n` copies in one worker. Rewards are float64, as Gymnasium has them.
 
@@ -192,9 +251,8 @@ class ForeignCopies(AbstractCopies):
         self._stranded = np.zeros(n, bool)  # in one that was lost with the worker
         self._broken = np.zeros(n, bool)  # whose episode has failed
         self._hurt = False  # whether there are any such: else a step costs less
-        self._recent: collections.deque[str] = collections.deque(maxlen=100)  # why it failed, or ""
+        self._tally = tally(env)
         self._whys: dict[int, str] = {}
-        self._discarded = 0  # episodes, since these copies were made
         self._backend: worker.Environments | worker.Process | None = None
         _SIZES[env] = sizes = self._opened().sizes()
         team = () if sizes["agents"] is None else (sizes["agents"],)
@@ -231,8 +289,8 @@ class ForeignCopies(AbstractCopies):
 
     @property
     def failures(self) -> int:
-        """How many of the last 100 episodes have failed."""
-        return sum(map(bool, self._recent))
+        """How many of the last 100 episodes of this task have failed."""
+        return self._tally.failures
 
     def failure_text(self, i: int) -> str:
         """What went wrong, in which copy, at which step, with which seed, and what to do."""
@@ -258,7 +316,7 @@ class ForeignCopies(AbstractCopies):
         ended = frame.terminated | frame.truncated
         if ended.any():
             self._running &= ~ended
-            self._recent.extend([""] * int(ended.sum()))
+            self._tally.add([""] * int(ended.sum()))
         acting = None if frame.active is None else frame.active & ~ended[:, None]
         ends = (frame.terminated, frame.truncated)
         return HostStep(frame.obs, frame.rewards, *ends, acting, failed, frame.gone)
@@ -317,28 +375,13 @@ class ForeignCopies(AbstractCopies):
         """Count, and say when it is too much."""
         for copy, fault in faults.items():
             self._whys[copy] = self._told(name, copy, fault)
-            self._recent.append(self._whys[copy])
-            self._discarded += 1
-            self._say(self._whys[copy])
+        self._tally.add([self._whys[copy] for copy in faults])
         playing = int(self._running.sum()) - len(faults)  # as good as any until they fail
-        failures, recent = self.failures, min(len(self._recent) + playing, 100)
-        most = self._env.tolerated
-        if failures > most * recent and (failures >= 3 or most == 0):
-            first = next(filter(None, self._recent))
+        try:
+            self._tally.check(playing)
+        except EnvironmentFailure as failure:
             self.close(grace=0.0)
-            count = f" ({failures} of {recent} episodes failed)" if failures > 1 else ""
-            raise EnvironmentFailure(f"{first}{count}") from next(iter(faults.values()))
-
-    def _say(self, why: str) -> None:
-        """The first, tenth, hundredth … failure, on the error stream."""
-        if self._env.tolerated and math.log10(self._discarded).is_integer():
-            with contextlib.suppress(OSError, ValueError):  # it is not read any more
-                print(
-                    f"credo: {self._discarded:,} episode{'s' * (self._discarded > 1)} failed and "
-                    f"left out, now: {why}. The run ends if more than {self._env.tolerated:.0%} of "
-                    "the last 100 fail (--tolerated)",
-                    file=sys.stderr,
-                )
+            raise failure from next(iter(faults.values()))
 
     def _told(self, name: str, copy: int, fault: worker.Fault) -> str:
         where = f"step {self._steps[copy]}" if name == "step" else "the reset"
@@ -373,11 +416,18 @@ class _Kept(threading.local):
 
     def __init__(self):
         self.copies: dict[tuple[AbstractForeignEnvironment, int], ForeignCopies] = {}
+        self.tallies: dict[AbstractForeignEnvironment, Tally] = {}
+        self.elsewhere = False  # whether failures are judged by another process
 
 
 _OPEN = _Kept()
 _ALL: weakref.WeakSet[ForeignCopies] = weakref.WeakSet()
 _SIZES: dict[AbstractForeignEnvironment, dict[str, Any]] = {}
+
+
+def known(env: AbstractForeignEnvironment, sizes: dict[str, Any]) -> None:
+    """Take what another process has found out of a task, which need not be opened for it here."""
+    _SIZES[env] = sizes
 
 
 def close_all() -> None:

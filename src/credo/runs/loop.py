@@ -29,6 +29,7 @@ from .. import compilation
 from ..compilation import jit
 from ..environments import processes
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
+from ..playing import players
 from ..replay import shapes_alone
 from ..types import NOTHING
 from . import callbacks, checkpoint, config, files, log, record, screen, segments, weights
@@ -364,7 +365,8 @@ def _train(
     """From `saved` to the end of the budget. The caller holds the lock."""
     training = _Training(run, algorithm, saved, options, heard)
     del saved  # its state is donated: the old one may not be held
-    with Signals(quiet=not options.progress) as signals, training.bar:
+    sharing = players.using(options.processes)
+    with Signals(quiet=not options.progress) as signals, training.bar, sharing:
         reason = training.go_on(signals)
     if reason == "signal":
         where = training.budget.where(training.generation, training.frames)

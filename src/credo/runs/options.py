@@ -32,6 +32,10 @@ class RunOptions:
     wall_clock: float | None = None
     """Seconds of training after which to save and end, at least 0. None: no limit."""
 
+    processes: int | None = None
+    """Processes that play episodes of tasks outside JAX at the same time, at least 1; None: one for
+    each core, once this one has played for two seconds. Their number changes no number of a run."""
+
     checkpoint_every: float = 60.0
     """Seconds between two checkpoints, at least 0; 0: after every dispatch."""
 
@@ -63,7 +67,8 @@ class RunOptions:
             require.at_least(name, getattr(self, name), 0)
         if self.stop_at is not None and math.isnan(self.stop_at):
             raise ValueError("stop_at is nan: give a champion score, or None to stop at none")
-        require.at_least("keep", self.keep, 1)
+        for name in ("keep", "processes"):
+            require.at_least(name, getattr(self, name), 1)
         object.__setattr__(self, "callbacks", tuple(self.callbacks))
         object.__setattr__(self, "loggers", tuple(self.loggers))
         for name in self.loggers:

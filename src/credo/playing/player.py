@@ -1,0 +1,53 @@
+"""A process that plays one part after another (see `players`): pickles in, pickles out, each behind
+its length. It computes on one core, and ends when its input does.
+
+What it reads is from the process that started it, and what it writes is read by that one alone.
+"""
+
+import dataclasses
+import os
+import pickle
+import struct
+import sys
+from typing import Any
+
+LENGTH = struct.Struct("=Q")
+
+
+def main() -> None:
+    """Play parts until there are none."""
+    if hasattr(os, "sched_setaffinity"):  # not on macOS
+        os.sched_setaffinity(0, {int(sys.argv[1])})  # before JAX counts its threads
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # whatever prints must not look like an answer
+    from ..compilation import enable_cache, float32
+    from ..environments import foreign
+
+    enable_cache()
+    foreign.judged_elsewhere()
+    with float32():
+        while head := sys.stdin.buffer.read(LENGTH.size):
+            body = sys.stdin.buffer.read(*LENGTH.unpack(head))
+            message = pickle.dumps(_answer(body), protocol=5)
+            answers.write(LENGTH.pack(len(message)))
+            answers.write(message)
+            answers.flush()
+
+
+def _answer(body: bytes) -> tuple[str, Any]:
+    """An outcome, or in words what was raised."""
+    from ..environments import foreign, names
+    from ..environments.host import EnvironmentFailure
+    from . import play
+
+    try:
+        part, known, sizes = pickle.loads(body)
+        names.register(known)
+        foreign.known(part.env, sizes)
+        told = foreign.tally(part.env)
+        told.news.clear()
+        return "outcome", dataclasses.replace(play(part), endings=told.news)
+    except EnvironmentFailure as error:
+        return "failure", str(error)
+    except Exception as error:  # the parent reports it
+        return "error", f"{type(error).__name__}: {error}"
