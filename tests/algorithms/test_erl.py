@@ -21,6 +21,7 @@ from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy, Meet
 from credo.evolution.crossover import MaskedCrossover
 from credo.learners.credit import Even
+from credo.learners.decomposed import Decomposed
 from credo.learners.manager import UCB
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3
@@ -522,7 +523,7 @@ def test_the_hybrid_and_its_learner_alone_differ_in_nothing_else():
     for name in ("network", "redistribute", "normalize_observations", "sampling"):
         assert getattr(alone, name) == getattr(hybrid, name)
     assert alone.updates_per_frame == hybrid.updates_per_frame == 1.0
-    assert hybrid.redistribute == Even(late_only=True)  # dense rewards stay as they are
+    assert hybrid.redistribute == Decomposed()  # dense rewards stay as they are
     evolution = ERL.hybrid(Copy(), learners=())  # needs nothing that asks a learner
     assert (evolution.share, evolution.horizon) == (None, None)
     assert evolution.breeder == hybrid.breeder
@@ -546,3 +547,21 @@ def test_the_hybrid_and_its_learner_alone_differ_in_nothing_else():
 def test_impossible_settings_are_refused(fields, told):
     with pytest.raises(ValueError, match=told):
         evolved(ALGORITHM, **fields)
+
+
+def test_where_rewards_are_not_late_the_hybrid_redistributes_nothing():
+    def after(how):
+        task = Copy()
+        fields = {"population_size": K, "warmup_frames": 10, "updates_per_frame": 0.2}
+        algorithm = ERL.hybrid(task, MLP(hidden=(8,)), redistribute=how, **fields)
+        algorithm = dataclasses.replace(algorithm, replay_capacity=500)
+        state = algorithm.init(key=jax.random.key(0))
+        for g in range(3):
+            state, metrics = algorithm.generation(state, key=jax.random.key(g))
+        return state, metrics
+
+    (decomposed, told), (even, _) = after(Decomposed()), after(Even(late_only=True))
+    assert told["updates"] > 0
+    assert told["redistribution_loss"] == NOTHING
+    for name in ("population", "learners", "replay"):
+        assert same(getattr(decomposed, name), getattr(even, name))

@@ -39,6 +39,7 @@ from ..evolution.mutation import MatrixMutation
 from ..learners.base import AbstractLearner
 from ..learners.coach import AbstractCoach
 from ..learners.credit import AbstractRedistribution, Even
+from ..learners.decomposed import Decomposed
 from ..learners.horizon import AbstractHorizon, Truncated
 from ..learners.manager import UCB, AbstractManager
 from ..learners.sac import HYBRID_NETWORK, modern
@@ -150,12 +151,12 @@ class ERL(Hybrid):
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """One preset for dense and late rewards: policies that mutation moves, judged by 200 steps
         and the critic, beside a learner of this decade that earns its frames, joins every
-        generation, and sees late returns spread. Chosen on seeds from 1000 on; docs, hybrid, say by
-        what."""
+        generation, and sees late returns decomposed. Chosen on seeds from 1000 on; docs, hybrid,
+        say by what."""
         if env.agents is not None:
             raise ValueError("hybrid is for one agent: train a team by merl, or MERL.merl(env)")
         settings: dict[str, Any] = {"learners": (modern(),), "share": Earned(0.7, 0.9)}
-        settings |= {"elite_fraction": 0.2, "sync_period": 1, "redistribute": Even(late_only=True)}
+        settings |= {"elite_fraction": 0.2, "sync_period": 1, "redistribute": Decomposed()}
         settings |= {"warmup_frames": 5_000, "horizon": Truncated(200)}
         if not overrides.get("learners", True):  # evolution alone: nobody to share with or to ask
             settings |= {"share": None, "horizon": None}

@@ -17,7 +17,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from .. import require, tree
 from ..compilation import float32
 from ..learners.base import AbstractLearner, learn
-from ..learners.credit import AbstractRedistribution, Even
+from ..learners.credit import AbstractRedistribution
+from ..learners.decomposed import Decomposed
 from ..learners.sac import HYBRID_NETWORK, SAC, modern
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, TEAM, ddpg, maddpg, matd3
 from ..networks.base import AbstractNetwork, AbstractPolicy
@@ -96,7 +97,7 @@ class OffPolicy(eqx.Module):
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The learner of `ERL.hybrid` alone, with the same network and the same view of rewards."""
         settings: dict[str, Any] = {"learner": modern(), "start_frames": 5_000}
-        settings |= {"redistribute": Even(late_only=True)}
+        settings |= {"redistribute": Decomposed()}
         return cls(env, network or HYBRID_NETWORK, **settings | overrides)
 
     @classmethod

@@ -3,7 +3,7 @@ equal frames and updates.
 
 hybrid-dense: four tasks of MuJoCo as they are. hybrid-late: the same, where the whole return is
 paid at the last step; beside the learner that sees returns as they are paid stands that of the
-preset, which sees them spread. Shared rewards are beyond-7-decoys.
+preset, which sees them decomposed. Shared rewards are beyond-7-decoys.
 
 The preset was chosen on seeds from 1,000 on, with up to 300,000 frames of the four tasks; reported
 runs have seeds from 0 on.
@@ -21,7 +21,7 @@ from .views import Improvement
 
 TASKS = ("Swimmer-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
 HYBRID, LEARNER, EVOLUTION = "hybrid", "its learner alone", "its evolution alone"
-SPREAD = "its learner alone, returns spread"
+DECOMPOSED = "its learner alone, returns decomposed"
 METHODS = {
     HYBRID: ERL.hybrid,
     LEARNER: partial(OffPolicy.hybrid, redistribute=None),
@@ -48,8 +48,8 @@ def dense(budget: str) -> list[Cell]:
 
 
 def late(budget: str) -> list[Cell]:
-    """The same with returns at the last step, and the learner that sees them spread."""
-    methods = METHODS | {SPREAD: OffPolicy.hybrid}
+    """The same with returns at the last step, and the learner that sees them decomposed."""
+    methods = METHODS | {DECOMPOSED: OffPolicy.hybrid}
     return [
         cell(name, build, task, budget, delayed=True, runs=LATE[budget])
         for task in tasks(budget)
