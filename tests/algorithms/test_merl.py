@@ -12,7 +12,7 @@ from evolved import evolved
 
 from credo import rollout, tree
 from credo.algorithms.erl import ERL
-from credo.algorithms.hybrid import averaged
+from credo.algorithms.hybrid import breed
 from credo.algorithms.lineage import DRAWN, INJECTED
 from credo.algorithms.merl import BREEDER, LOCAL, MERL
 from credo.algorithms.neuroevolution import Neuroevolution
@@ -529,6 +529,7 @@ def test_teams_may_be_ranked_by_every_generation_that_they_lived_through():
     earned, times = jnp.zeros(K).at[0].set(9.0), jnp.zeros(K).at[0].set(1.0)
     lineage = dataclasses.replace(after.lineage, earned=earned, times=times)
     fitness = jnp.zeros(K).at[0].set(9.0).at[1].set(10.0)
-    _, average = averaged(algorithm, dataclasses.replace(after, lineage=lineage), fitness)
-    assert int(jnp.argmax(average)) == 0
-    assert int(jnp.argmax(averaged(ALGORITHM, after, fitness)[1])) == 1
+    after = dataclasses.replace(after, lineage=lineage)
+    for ranked, best in ((algorithm, 0), (ALGORITHM, 1)):
+        state, _ = breed(ranked, after, fitness, key=jax.random.key(2))
+        assert same(state.champion, tree.take(after.population, best))

@@ -53,7 +53,7 @@ from ..replay import Sampling
 from ..rollout import Environment
 from ..types import Metrics
 from .aid import coached, play_ahead, preselect
-from .hybrid import Hybrid, HybridState, averaged, balance, breed, inject, play, teach, tested
+from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
 
 TABLE_5_1 = {  # task: (ψ, ξ, ω)
     "HalfCheetah": (0.1, 1, 10),
@@ -200,9 +200,8 @@ class ERL(Hybrid):
             state = balance(self, state, fitness)
 
         # 8-15: rank, keep the elites, select, cross and mutate.
-        state, average = averaged(self, state, fitness)
         breeding = breed if self.surrogate is None else preselect
-        state, bred = breeding(self, state, average, key=breed_key)
+        state, bred = breeding(self, state, fitness, key=breed_key)
 
         # 16-29: learners play too, with noise, and their mean return is their value; then as many
         # updates as frames, each learner on minibatches of its own.

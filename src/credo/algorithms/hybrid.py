@@ -217,17 +217,12 @@ def _noted(how: AbstractRedistribution, state: HybridState, experience, played) 
     return replace(state, replay=replay, known=how.noted(state.known, replay, experience, played))
 
 
-def averaged(hybrid: Hybrid, state: HybridState, fitness: Fitness) -> tuple[HybridState, Fitness]:
-    """What members are ranked by: their fitness, or, if they `remember`, that of every generation
-    that they lived through."""
-    if not hybrid.remember:
-        return state, fitness
-    lineage, average = state.lineage.averaged(fitness)
-    return replace(state, lineage=lineage), average
-
-
 def breed(hybrid: Hybrid, state: HybridState, fitness: Fitness, *, key: Key) -> Result:
-    """The next population with its lineage, and the champion of this one."""
+    """The next population with its lineage, and the champion of this one. Members that `remember`
+    are ranked by the fitness of every generation that they lived through."""
+    if hybrid.remember:
+        lineage, fitness = state.lineage.averaged(fitness)
+        state = replace(state, lineage=lineage)
     given = (state.breeding, state.population, state.lineage, fitness)
     population, lineage, breeding, champion, metrics = bred(hybrid, *given, key=key)
     after = {"breeding": breeding, "generation": state.generation + 1}

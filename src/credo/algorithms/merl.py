@@ -49,7 +49,7 @@ from ..rollout import Environment
 from ..types import Metrics
 from .aid import coached, play_ahead, preselect
 from .erl import BREEDER as ERL_BREEDER
-from .hybrid import Hybrid, HybridState, averaged, balance, breed, inject, play, teach, tested
+from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
 
 LOCAL = TD3(signal="local", **TEAM)
 """The learner of the team: one twin critic that all agents share (lines 2 and 16-21)."""
@@ -140,8 +140,7 @@ class MERL(Hybrid):
 
         # 10-14: rank, keep e elites, select k-e by tournament, cross with elites; and mutate.
         breeding = breed if self.surrogate is None else preselect
-        state, average = averaged(self, state, fitness)
-        state, bred = breeding(self, state, average, key=breed_key)
+        state, bred = breeding(self, state, fitness, key=breed_key)
 
         # 8: Rollout(π_pg, R, noise=W_g, ξ=1), in parallel worlds.
         # 15-21: for agent k: a minibatch from R^k; descend the critic's loss; follow the gradient
