@@ -1,5 +1,6 @@
 """Episodes that several processes play: the same bits, whoever dies."""
 
+import dataclasses
 import os
 import pathlib
 import signal
@@ -10,12 +11,12 @@ import numpy as np
 import pytest
 
 from credo import rollout, tree
-from credo.environments import foreign
+from credo.environments import foreign, processes
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.host import EnvironmentFailure
 from credo.environments.pettingzoo import PettingZoo
 from credo.evolution.breeder import draw
-from credo.networks.mlp import MLP
+from credo.networks.mlp import MLP, MLPPolicy
 from credo.networks.mmu import MMU
 from credo.networks.team import Team
 from credo.playing import Outcome, Part, joined, players, split
@@ -110,6 +111,31 @@ def test_one_that_dies_again_and_again_is_named(monkeypatch):
     assert crew._all == [None, None]
 
 
+def test_what_another_process_cannot_have_is_played_here():
+    class Policy(MLPPolicy):  # of a function: it cannot be sent
+        pass
+
+    alone = played(TASK, MLP(hidden=(4,)))
+    own = draw(MLP(hidden=(4,)), TASK.sizes, 7, key=jax.random.key(0))
+    fields = {field.name: getattr(own, field.name) for field in dataclasses.fields(own)}
+    hasty = players.Players(2, patience=0.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(players._CURRENT, "players", hasty, raising=False)
+        mine = rollout.collect(TASK, Policy(**fields), 2, key=jax.random.key(1))
+    assert same(alone, mine)
+    assert hasty.number == 1
+    assert hasty._all == [None, None]
+
+
+def test_an_answer_that_nobody_took_is_not_that_to_the_next_part(crew, monkeypatch):
+    alone = played(TASK, MLP(hidden=(8,)))
+    with monkeypatch.context() as patch:
+        patch.setattr(players, "_heard", lambda answer: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            played(TASK, MLP(hidden=(16, 16)), crew=crew)
+    assert same(alone, played(TASK, MLP(hidden=(8,)), crew=crew))
+
+
 def test_failures_count_together_wherever_they_were(crew):
     # Two of seven members fail in their second episode: each process sees one at most.
     kwargs = {"every": 2, "fault": "nan", "at": 2}
@@ -141,6 +167,6 @@ def test_outside_the_block_this_process_plays_alone():
         assert players._CURRENT.players.number == 2
     assert players._CURRENT.players is None
     with players.using(None):
-        several = len(players.cores()) > 1
+        several = len(processes.cores()) > 1
         assert (players._CURRENT.players is not None) == several
     assert tree.size(draw(MLP(), (3, 1), 2, key=jax.random.key(0))) == 2

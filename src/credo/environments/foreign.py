@@ -425,9 +425,15 @@ _ALL: weakref.WeakSet[ForeignCopies] = weakref.WeakSet()
 _SIZES: dict[AbstractForeignEnvironment, dict[str, Any]] = {}
 
 
-def known(env: AbstractForeignEnvironment, sizes: dict[str, Any]) -> None:
-    """Take what another process has found out of a task, which need not be opened for it here."""
-    _SIZES[env] = sizes
+def told(env: AbstractForeignEnvironment) -> tuple[dict[str, Any] | None, dict[str, Any]]:
+    """What another process must know to play a task: as which id it is registered, and sizes."""
+    return names.registered(env.id) if env.api == "gymnasium" else None, env._sizes()
+
+
+def know(env: AbstractForeignEnvironment, what: tuple[Any, dict[str, Any]]) -> None:
+    """Take what `told` said in another process; the task need not be opened for it here."""
+    names.register(what[0])
+    _SIZES[env] = what[1]
 
 
 def close_all() -> None:

@@ -41,6 +41,13 @@ class Refused(RuntimeError):
         return f"{self.what}: {self.fix}"
 
 
+def cores() -> list[int]:
+    """Those that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
 def allow(doing: str = "starts training", *, opening: bool = False) -> None:
     """Raise `Refused` where training, or a child of ours (`opening`), would multiply or never end:
     while a child imports the user's script, and in a process forked after JAX was used."""

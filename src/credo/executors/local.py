@@ -18,6 +18,7 @@ import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from ..environments import processes
 from ..environments.processes import Child
 from ..runs import checkpoint, config, log, record, screen
 from ..runs.budget import Budget
@@ -169,7 +170,7 @@ def run(
     if not waiting:
         return
     crew = _Crew(waiting, title)
-    number = crew.work(min(workers or len(config.available_cores()), len(waiting)))
+    number = crew.work(min(workers or len(processes.cores()), len(waiting)))
     if number:
         raise Interrupted(f"stopped and saved; {again} goes on where it was", 128 + number)
     if crew.failures:
@@ -208,7 +209,7 @@ class _Crew:
 
     def work(self, number: int) -> int:
         """Do all jobs with this many workers; the signal that ended it, or 0."""
-        cores, asked = config.available_cores(), False
+        cores, asked = processes.cores(), False
         try:
             with self.signals:
                 self.line.start(self.told())

@@ -36,14 +36,16 @@ def main() -> None:
 
 def _answer(body: bytes) -> tuple[str, Any]:
     """An outcome, or in words what was raised."""
-    from ..environments import foreign, names
+    from ..environments import foreign
     from ..environments.host import EnvironmentFailure
     from . import play
 
     try:
-        part, known, sizes = pickle.loads(body)
-        names.register(known)
-        foreign.known(part.env, sizes)
+        part, what = pickle.loads(body)
+        foreign.know(part.env, what)
+    except Exception as error:  # a class of the user's script, which this process did not run
+        return "unknown", f"{type(error).__name__}: {error}"
+    try:
         told = foreign.tally(part.env)
         told.news.clear()
         return "outcome", dataclasses.replace(play(part), endings=told.news)

@@ -6,9 +6,8 @@ short runs pay nothing. One that dies is begun anew, and plays its part again.
 """
 
 import contextlib
-import os
+import dataclasses
 import pickle
-import struct
 import subprocess
 import threading
 import time
@@ -18,22 +17,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..environments import foreign, names
+from ..environments import foreign
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
-from ..environments.processes import Child
+from ..environments.processes import Child, cores
 from . import Outcome, Part, joined, play, player, split
+from .player import LENGTH
 
 PATIENCE = 2.0  # seconds of playing here before others are asked
 TRIES = 3  # of a part whose player dies
-LENGTH = struct.Struct("=Q")
-GRACE = 2.0  # seconds that a player has to end in
-
-
-def cores() -> list[int]:
-    """Those that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
 
 
 class Players:
@@ -47,23 +38,30 @@ class Players:
         """Play a part, here or shared out."""
         began = time.monotonic()
         parts = split(part, self.number)
-        alone = len(parts) < 2 or not _sendable(part.env) or self._spent < self._patience
-        if alone:
-            outcome = play(part)
-            self._spent += time.monotonic() - began
-            return outcome
-        outcome = joined(self._played(parts))
-        told = foreign.tally(part.env)  # pyright: ignore[reportArgumentType]
-        told.add(outcome.endings)
-        told.check()
+        if len(parts) > 1 and _sendable(part.env) and self._spent >= self._patience:
+            try:
+                outcome = joined(self._played(parts))
+            except _Unknown:
+                self.number = 1
+            else:
+                told = foreign.tally(part.env)  # pyright: ignore[reportArgumentType]
+                told.add(outcome.endings)
+                told.check()
+                return outcome
+        outcome = play(part)
+        self._spent += time.monotonic() - began
         return outcome
 
     def _played(self, parts: Sequence[Part]) -> list[Outcome]:
         """One part by each player, at the same time."""
         told = [_told(part) for part in parts]
-        for i, message in enumerate(told):
-            self._give(i, message)
-        return [self._taken(i, message) for i, message in enumerate(told)]
+        try:
+            for i, message in enumerate(told):
+                self._give(i, message)
+            return [self._taken(i, message) for i, message in enumerate(told)]
+        except BaseException:  # an answer that nobody took would pass for that to the next part
+            self.close()
+            raise
 
     def _give(self, i: int, message: bytes) -> None:
         one = self._all[i]
@@ -81,7 +79,6 @@ class Players:
                 return _heard(answer)
             self._drop(i)
             self._give(i, message)
-        self.close()
         raise RuntimeError(
             f"a process that plays episodes ended {TRIES} times over the same ones: give it more "
             "memory, or --processes 1 to see what happens"
@@ -94,8 +91,13 @@ class Players:
 
     def close(self) -> None:
         """End all processes."""
-        for i in range(self.number):
+        for i in range(len(self._all)):
             self._drop(i)
+
+
+class _Unknown(Exception):
+    """A policy or task that another process cannot have: of a class of the user's script, or one
+    that was made in a function. It is played here, as well."""
 
 
 class _Player(Child):
@@ -137,10 +139,15 @@ def _sendable(env: AbstractHostEnvironment) -> bool:
 
 def _told(part: Part) -> bytes:
     """What a player is told: the part, and what it must know to open the task."""
-    env: Any = part.env
-    plain = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, part)
-    known = names.registered(env.id) if env.api == "gymnasium" else None
-    return pickle.dumps((plain, known, env._sizes()), protocol=5)
+    plain = jax.tree.map(
+        lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, part.population
+    )
+    part, env = dataclasses.replace(part, population=plain), part.env
+    try:
+        told = foreign.told(env)  # pyright: ignore[reportArgumentType]
+        return pickle.dumps((part, told), protocol=5)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise _Unknown(str(error)) from error
 
 
 def _heard(answer: tuple[str, Any]) -> Outcome:
@@ -148,7 +155,7 @@ def _heard(answer: tuple[str, Any]) -> Outcome:
     kind, said = answer
     if kind == "outcome":
         return said
-    raise {"failure": EnvironmentFailure}.get(kind, RuntimeError)(said)
+    raise {"failure": EnvironmentFailure, "unknown": _Unknown}.get(kind, RuntimeError)(said)
 
 
 class _Current(threading.local):

@@ -11,7 +11,6 @@ import functools
 import importlib
 import importlib.metadata
 import inspect
-import os
 import pathlib
 import platform
 import re
@@ -26,6 +25,7 @@ import jax
 import jaxtyping
 import numpy as np
 
+from ..environments import processes
 from ..environments.base import AbstractEnvironment
 from ..environments.foreign import AbstractForeignEnvironment
 from ..environments.host import AbstractHostEnvironment
@@ -346,17 +346,10 @@ def machine() -> dict[str, Any]:
     return {
         "versions": {"python": platform.python_version(), **versions},
         "processor": _processor(),
-        "cores": len(available_cores()),
+        "cores": len(processes.cores()),
         "device": jax.devices()[0].device_kind,
         "system": platform.platform(),
     }
-
-
-def available_cores() -> list[int]:
-    """The cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
 
 
 def _version(package: str) -> str | None:
