@@ -6,6 +6,7 @@ what the preset has; rows "with" have what was built, tried and left out.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,7 +19,7 @@ from ..learners.sac import modern
 from ..learners.share import Fixed
 from ..learners.surrogate import Preselection
 from ..learners.td3 import TD3, TD3_NETWORK
-from ..networks.mlp import MLP, Critic, ResidualCritic
+from ..networks.mlp import MLP, AbstractCritic, Critic, ResidualCritic
 from ..networks.values import Histogram, Quantiles
 from ..replay import Sampling
 from .base import Cell, Experiment
@@ -33,10 +34,9 @@ LEARNER_TASKS = ("HalfCheetah-v5", "Hopper-v5")
 HYBRID_TASKS = ("HalfCheetah-v5", "Swimmer-v5")
 
 
-def critic(**fields: Any) -> Critic:
+def critic(**fields: Any) -> AbstractCritic:
     """That of `modern`, changed."""
-    settings: dict[str, Any] = {"normalization": "before", "values": Histogram()}
-    return Critic(**settings | fields)
+    return replace(modern().critic, **fields)
 
 
 def sac(**fields: Any) -> dict[str, Any]:

@@ -82,8 +82,14 @@ _GRID = (  # a row for each of the first dashes, a column for each colour
 METHODS = {
     name: Look(color, dash) for dash, row in enumerate(_GRID) for color, name in enumerate(row)
 }
-ALIASES = {"gradient": "bptt", "evolution": "neuroevolution", "ff": "mlp", "feed": "mlp"}
-ALIASES |= {"hybrid": "erl", "learner": "sac"}
+ALIASES = {
+    "gradient": "bptt",
+    "evolution": "neuroevolution",
+    "ff": "mlp",
+    "feed": "mlp",
+    "hybrid": "erl",
+    "learner": "sac",
+}
 
 
 def method(label: str) -> str | None:
