@@ -230,3 +230,37 @@ def test_a_child_forked_after_jax_was_used_is_told(tmp_path):
     assert "'spawn' or 'forkserver'" in said.read_text()
     assert one(mine).obs.shape == (1, 2)  # the parent's are as they were
     mine.close()
+
+
+SETTLING = """
+import os, sys
+from credo.environments import processes
+processes.CLAIM = sys.argv[1]  # other tests settle too
+print(processes.settle(), *os.sched_getaffinity(0), flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.skipif(not processes.LINUX, reason="no process is bound to a core")
+def test_processes_settle_on_different_cores_whoever_started_them():
+    def settled() -> tuple[subprocess.Popen, int]:
+        line = [sys.executable, "-c", SETTLING, f"test-{os.getpid()}"]
+        pipe = subprocess.PIPE
+        process = subprocess.Popen(line, stdin=pipe, stdout=pipe, text=True)
+        assert process.stdout is not None
+        core, *allowed = map(int, process.stdout.readline().split())
+        assert allowed == [core]
+        return process, core
+
+    usable = processes.cores()
+    running = [settled() for _ in range(2 * len(usable))]
+    try:
+        assert [core for _, core in running] == usable * 2  # evenly
+        running[1][0].communicate()
+        again = settled()
+        assert again[1] == running[1][1]  # what has ended claims nothing
+        again[0].communicate()
+    finally:
+        for process, _ in running:
+            process.kill()
+            process.communicate()

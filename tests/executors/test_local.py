@@ -77,7 +77,7 @@ def test_a_worker_trains_like_this_process(trained, tmp_path):
 def test_what_is_finished_is_not_run_again(trained, monkeypatch):
     (first, _, second), _ = trained
     started = []
-    monkeypatch.setattr(local, "_start", lambda core: started.append(core))
+    monkeypatch.setattr(local, "_start", lambda: started.append(1))
     local.run([first, second], workers=2)
     assert started == []
     longer = wanting(first, generations=6)
@@ -130,7 +130,7 @@ def test_a_process_that_dies_is_told_and_replaced(tmp_path, monkeypatch):
     (tmp_path / "dies_once.py").write_text(DIES_ONCE)
     monkeypatch.syspath_prepend(str(tmp_path))
 
-    def start(core):
+    def start():
         pipe = subprocess.PIPE
         started.append(processes.Child("dies_once", stdin=pipe, stdout=pipe, text=True))
         return started[-1]
@@ -265,7 +265,7 @@ from credo.runs.options import RunOptions
 folder, hearing = sys.argv[1:]
 sys.path.append(folder)
 given = {"grace": 3600.0, "stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-local._start = lambda core: Child("stubborn", folder + "/told", hearing, **given)
+local._start = lambda: Child("stubborn", folder + "/told", hearing, **given)
 local.Job.finished = lambda self: False
 options = RunOptions(generations=5)
 local.run([local.Job(folder + "/run", {"class": "a:B"}, 0, options)], workers=1)

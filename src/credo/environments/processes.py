@@ -15,6 +15,7 @@ import os
 import pathlib
 import select
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -23,8 +24,11 @@ from typing import Any
 LINUX = sys.platform == "linux"
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 LONGEST = 5.0  # seconds that a guardian gets to kill what it guards
+CLAIM = "credo-core"  # what the names of claims begin with
+MOST_ON_A_CORE = 64  # processes that settle there; one more may run on any
 MULTIPLYING = "put it under if __name__ == '__main__'"
 
+_claims: list[socket.socket] = []  # on the cores that this process has settled on
 _worker = False  # whether this process is a child, started here
 _opening = True  # whether code that is imported here may start children
 _forked = False  # whether it was forked from one in which JAX has threads
@@ -46,6 +50,30 @@ def cores() -> list[int]:
     if hasattr(os, "sched_getaffinity"):  # not on macOS
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
+
+
+def settle() -> int | None:
+    """Compute from here on on one core alone: the one that the fewest other processes of ours have
+    settled on, whichever command started them. The core; None where a process cannot be bound.
+
+    Call it before JAX counts its threads. A core is claimed by a name in Linux's abstract socket
+    namespace, which is free again when the process ends, however it ends.
+    """
+    if not hasattr(os, "sched_setaffinity") or not LINUX:
+        return None
+    usable = cores()
+    for turn in range(MOST_ON_A_CORE):
+        for core in usable:
+            claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            try:
+                claim.bind(f"\0{CLAIM}-{os.getuid()}-{core}-{turn}")
+            except OSError:  # it is another's
+                claim.close()
+                continue
+            _claims.append(claim)
+            os.sched_setaffinity(0, {core})
+            return core
+    return None
 
 
 def allow(doing: str = "starts training", *, opening: bool = False) -> None:

@@ -188,7 +188,6 @@ class _Worker(NamedTuple):
     """A process that has a job."""
 
     process: Any  # a `Child`, whose streams are pipes
-    core: int
     job: Job
 
 
@@ -209,12 +208,12 @@ class _Crew:
 
     def work(self, number: int) -> int:
         """Do all jobs with this many workers; the signal that ended it, or 0."""
-        cores, asked = processes.cores(), False
+        asked = False
         try:
             with self.signals:
                 self.line.start(self.told())
-                for i in range(number):
-                    self.give(None, cores[i % len(cores)])
+                for _ in range(number):
+                    self.give(None)
                 while self.under_way:
                     if self.signals.received and not asked:
                         asked = True
@@ -227,14 +226,14 @@ class _Crew:
             self.line.stop()
         return self.signals.received
 
-    def give(self, process: Any, core: int) -> None:
+    def give(self, process: Any) -> None:
         """Give the next job to a worker, or to a new one; without a job it ends."""
         job = None if self.signals.received else next(self.queue, None)
         if job is None:
             _end(process)
             return
-        process = process or _start(core)
-        self.under_way.append(_Worker(process, core, job))
+        process = process or _start()
+        self.under_way.append(_Worker(process, job))
         with contextlib.suppress(BrokenPipeError):  # it is dead, and `listen` hears of it
             process.stdin.write(job.message() + "\n")
             process.stdin.flush()
@@ -243,7 +242,7 @@ class _Crew:
         """Take the answers that are there, and give what is next."""
         ready = select.select([one.process.stdout for one in self.under_way], [], [], 0.05)[0]
         for one in [one for one in self.under_way if one.process.stdout in ready]:
-            process, core, job = one
+            process, job = one
             answer = _answer(process)
             self.under_way.remove(one)
             if "error" in answer:
@@ -254,7 +253,7 @@ class _Crew:
             if "error" in answer:
                 _end(process)
                 process = None
-            self.give(process, core)
+            self.give(process)
 
     def show(self) -> None:
         """Say now and then how far they are."""
@@ -274,11 +273,11 @@ class _Crew:
         _kill(*[one.process for one in self.under_way])
 
 
-def _start(core: int) -> Child:
-    """A worker that computes on this core alone."""
+def _start() -> Child:
+    """A worker, which computes on one core alone."""
     pipe = subprocess.PIPE
     how = {"grace": SAVE, "opening": True}
-    return Child(worker.__name__, str(core), **how, stdin=pipe, stdout=pipe, text=True)
+    return Child(worker.__name__, **how, stdin=pipe, stdout=pipe, text=True)
 
 
 def _answer(process: Any) -> dict[str, Any]:

@@ -14,11 +14,12 @@ import sys
 import warnings
 from typing import Any
 
+from ..environments import processes
+
 
 def main() -> None:
     """Take jobs until there are none. Ends with 128 + n after signal n, saved."""
-    if hasattr(os, "sched_setaffinity"):  # not on macOS
-        os.sched_setaffinity(0, {int(sys.argv[1])})  # before JAX counts its threads
+    processes.settle()
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever prints must not look like an answer
 

@@ -11,13 +11,14 @@ import struct
 import sys
 from typing import Any
 
+from ..environments import processes
+
 LENGTH = struct.Struct("=Q")
 
 
 def main() -> None:
     """Play parts until there are none."""
-    if hasattr(os, "sched_setaffinity"):  # not on macOS
-        os.sched_setaffinity(0, {int(sys.argv[1])})  # before JAX counts its threads
+    processes.settle()
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever prints must not look like an answer
     from ..compilation import enable_cache, float32

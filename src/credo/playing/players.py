@@ -66,8 +66,7 @@ class Players:
     def _give(self, i: int, message: bytes) -> None:
         one = self._all[i]
         if one is None or one.over(0.0):
-            usable = cores()
-            one = self._all[i] = _Player(usable[i % len(usable)])
+            one = self._all[i] = _Player()
         one.give(message)
 
     def _taken(self, i: int, message: bytes) -> Outcome:
@@ -103,9 +102,9 @@ class _Unknown(Exception):
 class _Player(Child):
     """One process, and the pipes to it."""
 
-    def __init__(self, core: int):
+    def __init__(self):
         pipe = subprocess.PIPE
-        super().__init__(player.__name__, str(core), opening=True, stdin=pipe, stdout=pipe)
+        super().__init__(player.__name__, opening=True, stdin=pipe, stdout=pipe)
         assert self.stdin is not None
         assert self.stdout is not None
         self._to, self._from = self.stdin, self.stdout
