@@ -4,8 +4,11 @@ There are two ways in. A population plays for its returns: `evaluate`, and `coll
 keeps the transitions. One policy is looked at: `record` keeps an episode of it, moment by moment.
 """
 
+import contextlib
+import dataclasses
 import math
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -101,9 +104,8 @@ def evaluate(
         env.require_once(population, episodes)
     if isinstance(env, AbstractSequenceTask) and packed:
         return _answer(env, population, episodes, common, key=key)
-    lanes = _lanes(population, episodes, common, key=key)
     play = _play_in_turn if tree.batch(population) < tree.size(population) else _play
-    return play(env, lanes, jnp.int32(episodes), False)[0]
+    return play(env, _lanes(population, episodes, common, key=key), jnp.int32(episodes), False)[0]
 
 
 @float32()
@@ -158,11 +160,64 @@ def record(
 
 
 def score(
-    env: Environment, policy: AbstractPolicy, episodes: int, *, key: PRNGKeyArray
+    env: Environment, policy: AbstractPolicy, episodes: int, reward: str = "", *, before=None, key
 ) -> Float[Array, ""]:
-    """Mean return of one policy on fresh episodes, of the signal that the task reports."""
+    """Mean return of one policy on fresh episodes, of a reward; "": of that which the task reports.
+
+    **Arguments:** `before`: the last score, given where nothing is decided by the new one before
+    the generation is over. Outside JAX it may then be postponed (`postponing`): `before` stands for
+    it until it is known. -inf: there was none, and this one is waited for.
+    """
+    if before is not None and isinstance(env, AbstractHostEnvironment) and _TESTS.wait(before):
+        return _postpone(env, policy, episodes, reward, before, key=key)
     played = evaluate(env, tree.single(policy), episodes, key=key)
-    return jnp.mean(sound(env, played.of(env.reported)))
+    return jnp.mean(sound(env, played.of(reward or env.reported)))
+
+
+@dataclasses.dataclass
+class Postponed:
+    """A test outside JAX whose episodes are not played yet, or not waited for."""
+
+    env: AbstractHostEnvironment
+    asked: players.Asked
+    reward: str
+
+    def score(self) -> Float[Array, ""]:
+        """What `score` would have said. Raises `EnvironmentFailure` as rollouts do."""
+        returns = _evaluated(self.asked.result()).of(self.reward or self.env.reported)
+        return jnp.mean(sound(self.env, returns))
+
+
+class _Tests(threading.local):
+    postponed: list[Postponed] | None = None
+
+    def wait(self, before: Any) -> bool:
+        """Whether a test may."""
+        return self.postponed is not None and before != -np.inf
+
+
+_TESTS = _Tests()
+
+
+@contextlib.contextmanager
+def postponing() -> Iterator[list[Postponed]]:
+    """In here `score` need not wait for episodes outside JAX: they join whatever is played next.
+    The list fills with what was postponed."""
+    earlier, _TESTS.postponed = _TESTS.postponed, []
+    try:
+        yield _TESTS.postponed
+    finally:
+        _TESTS.postponed = earlier
+
+
+def _postpone(
+    env: AbstractHostEnvironment, policy: AbstractPolicy, episodes: int, reward, before, *, key
+) -> Float[Array, ""]:
+    """The score from before, in the place of one that comes later."""
+    assert _TESTS.postponed is not None
+    part = _part(env, tree.single(policy), episodes, episodes, True, False, key=key)
+    _TESTS.postponed.append(Postponed(env, players.ask(part), reward))
+    return jnp.float32(before)
 
 
 def blank(env: Environment) -> Transition:
@@ -248,9 +303,8 @@ def _play(
         for x in jax.tree.leaves((step.obs, step.rewards)):
             sound = sound & _sound(x)
         lost = lost | (active & ~sound)
-        returns = jax.tree.map(
-            lambda sum_, x: sum_ + jnp.where(_over(active, x), x, 0.0), returns, step.rewards
-        )
+        paid = jax.tree.map(lambda x: jnp.where(_over(active, x), x, 0.0), step.rewards)
+        returns = jax.tree.map(jnp.add, returns, paid)
         steps = steps + active.astype(jnp.int32)
         if record:
             ends = (step.ended, step.truncated, acting)
@@ -332,6 +386,16 @@ def _record_on_host(
 
 
 def _play_on_host(
+    env: AbstractHostEnvironment, population: PyTree, *how: Any, key: PRNGKeyArray
+) -> tuple[Evaluation, Any]:
+    """The same with copies outside JAX: actions go there and time steps come back, once per step
+    for all lanes together. `how`: arguments of `_part`."""
+    came = players.ask(_part(env, population, *how, key=key)).result()
+    rows = None if came.rows is None else Experience(Transition(*came.rows), None)
+    return _evaluated(came), rows
+
+
+def _part(
     env: AbstractHostEnvironment,
     population: PyTree,
     episodes: int,
@@ -341,16 +405,16 @@ def _play_on_host(
     limit: Any = None,
     *,
     key: PRNGKeyArray,
-) -> tuple[Evaluation, Any]:
-    """The same with copies outside JAX: actions go there and time steps come back, once per step
-    for all lanes together."""
+) -> playing.Part:
+    """Episodes as they are asked for."""
     drawn = playing.draw((tree.size(population), episodes), common, key)
     worlds, policies = map(np.asarray, drawn)
     limit = None if limit is None else int(limit)
-    part = playing.Part(env, population, worlds, policies, int(wanted), record, limit)
-    came = players.played(part)
-    played = Evaluation(*jax.tree.map(jnp.asarray, (came.returns, came.steps)))
-    return played, None if came.rows is None else Experience(Transition(*came.rows), None)
+    return playing.Part(env, population, worlds, policies, int(wanted), record, limit)
+
+
+def _evaluated(came: playing.Outcome) -> Evaluation:
+    return Evaluation(*jax.tree.map(jnp.asarray, (came.returns, came.steps)))
 
 
 def _answer_these(

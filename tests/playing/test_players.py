@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from credo import rollout, tree
+from credo import playing, rollout
 from credo.environments import foreign, processes
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.host import EnvironmentFailure
@@ -19,7 +19,7 @@ from credo.evolution.breeder import draw
 from credo.networks.mlp import MLP, MLPPolicy
 from credo.networks.mmu import MMU
 from credo.networks.team import Team
-from credo.playing import Outcome, Part, joined, players, split
+from credo.playing import Outcome, Part, joined, play, players, shared
 
 TASK = Gymnasium("Pendulum-v1", max_episode_steps=15)
 ENVIRONMENTS = str(pathlib.Path(__file__).parents[1] / "environments")
@@ -44,15 +44,25 @@ def crew():
 def played(env, network, members=7, episodes=2, crew=None, **how):
     """A rollout of fresh policies; by `crew`, or by this process."""
     population = draw(network, env.sizes, members, key=jax.random.key(0))
-    before, players._CURRENT.players = players._CURRENT.players, crew
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(players._CURRENT, "players", crew or players.Players(1))
         return rollout.collect(env, population, episodes, key=jax.random.key(1), **how)
-    finally:
-        players._CURRENT.players = before
+
+
+def part(env, network, members, episodes=1, record=True, limit=None, seed=0, wanted=None) -> Part:
+    """Fresh policies with worlds of their own, as they are asked for."""
+    key = jax.random.key(seed)
+    population = draw(network, env.sizes, members, key=key)
+    worlds, keys = map(np.asarray, playing.draw((members, episodes), False, key))
+    return Part(env, population, worlds, keys, wanted or episodes, record, limit)
+
+
+def arrays(found):
+    return vars(found) if isinstance(found, Outcome) else found
 
 
 def same(a, b) -> bool:
-    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    pairs = zip(*(jax.tree.leaves(jax.tree.map(arrays, x)) for x in (a, b)), strict=True)
     return all(np.asarray(x).tobytes() == np.asarray(y).tobytes() for x, y in pairs)
 
 
@@ -74,17 +84,89 @@ def test_their_number_changes_no_bit(env, network, crew):
 
 
 def test_no_member_is_alone_and_all_are_there():
+    one = {"w": np.arange(7)}
     worlds = np.arange(14, dtype=np.uint32).reshape(7, 2)
-    part = Part(TASK, {"w": np.arange(7)}, worlds, np.zeros((7, 2, 2), np.uint32), 2, False)
+    population = Part(TASK, one, worlds, np.zeros((7, 2, 2), np.uint32), 2, False)
+    champion = dataclasses.replace(population, worlds=np.zeros((1, 5), np.uint32))
     for most in range(1, 9):
-        parts = split(part, most)
-        assert len(parts) == min(most, 3)
-        assert min(len(x.worlds) for x in parts) >= 2
-        assert np.concatenate([x.population["w"] for x in parts]).tolist() == list(range(7))
-        assert np.concatenate([x.worlds for x in parts]).tolist() == worlds.tolist()
-    two = [Outcome({"r": np.full((n, 2), n)}, np.full((n, 2), n), None, [str(n)]) for n in (2, 3)]
+        shares = shared([population], most)
+        assert len(shares) == min(most, 3)
+        slices = [part for share in shares for _, part in share]
+        assert min(len(x.worlds) for x in slices) >= 2
+        assert np.concatenate([x.population["w"] for x in slices]).tolist() == list(range(7))
+        assert np.concatenate([x.worlds for x in slices]).tolist() == worlds.tolist()
+        assert len(shared([champion], most)) == 1
+        both = shared([population, champion], most)
+        lanes = [sum(part.worlds.size for _, part in share) for share in both]
+        assert sum(lanes) == 19
+        assert most > 3 or max(lanes) - min(lanes) <= 6  # of three members at most
+        assert sorted({i for share in both for i, _ in share}) == [0, 1]
+    two = [Outcome({"r": np.full((n, 2), n)}, np.full((n, 2), n), None) for n in (2, 3)]
     assert joined(two).steps[:, 0].tolist() == [2, 2, 3, 3, 3]
-    assert joined(two).endings == ["2", "3"]
+
+
+def asked(crew, *parts):
+    """What comes of parts that are asked for together."""
+    waiting = [crew.ask(part) for part in parts]
+    return [one.result() for one in waiting]
+
+
+@pytest.mark.parametrize("task", [TASK, dataclasses.replace(TASK, at_once=3)], ids=["all", "turns"])
+def test_what_is_played_together_has_the_bits_of_what_is_played_alone(task, crew):
+    network = MLP(hidden=(16,))
+    parts = [
+        part(task, network, 4, 2, wanted=1),
+        part(task, network, 1, 5, record=False, seed=1),
+        part(task, network, 1, 2, limit=3, seed=2),
+        part(task, MMU(), 3, seed=3),
+    ]
+    alone = [play([one])[0] for one in parts]
+    assert same(alone, play(parts))
+    assert same(alone, asked(crew, *parts))
+    assert [x.rows is None for x in alone] == [False, True, False, False]
+    assert alone[2].steps.tolist() == [[3, 3]]
+
+
+def test_what_was_started_is_played_while_this_process_does_something_else(crew):
+    network = MLP(hidden=(16,))
+    first, second, late = (part(TASK, network, 4, seed=seed) for seed in range(3))
+    one, two = crew.ask(first), crew.ask(second)
+    crew.start()
+    assert crew._away is not None
+    three = crew.ask(late)  # it waits until those are back
+    assert same([three.result()], [play([late])[0]])
+    assert crew._away is None
+    assert same([one.result(), two.result()], [play([x])[0] for x in (first, second)])
+
+
+def test_what_nobody_wants_any_more_is_not_played():
+    class Counting(players.Players):
+        together: tuple[int, ...] = ()
+
+        def _play(self, together):
+            self.together = (*self.together, len(together))
+            super()._play(together)
+
+    crew, one = Counting(1), part(TASK, MLP(hidden=(4,)), 2)
+    forgotten, wanted = crew.ask(one), crew.ask(one)
+    del forgotten
+    wanted.result()
+    other = part(dataclasses.replace(TASK, max_episode_steps=3), MLP(hidden=(4,)), 2)
+    short, long = crew.ask(other), crew.ask(one)
+    assert short.result().steps.max() == 3
+    assert long.outcome is not None
+    assert crew.together == (1, 1, 1)  # another task is played by itself
+
+
+def test_who_asks_again_after_a_failure_is_answered():
+    kwargs = {"every": 1, "fault": "nan", "at": 2}
+    task = Gymnasium("failing:Rare", kwargs=kwargs, max_episode_steps=6, tolerated=0.0)
+    crew, network = players.Players(1), MLP(hidden=(4,))
+    one, other = crew.ask(part(task, network, 2)), crew.ask(part(task, network, 2))
+    with pytest.raises(EnvironmentFailure):
+        one.result()
+    with pytest.raises(RuntimeError, match="were given up when others failed"):
+        other.result()
 
 
 def test_one_that_dies_plays_its_part_again(crew, monkeypatch):
@@ -120,7 +202,7 @@ def test_what_another_process_cannot_have_is_played_here():
     fields = {field.name: getattr(own, field.name) for field in dataclasses.fields(own)}
     hasty = players.Players(2, patience=0.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(players._CURRENT, "players", hasty, raising=False)
+        patch.setattr(players._CURRENT, "players", hasty)
         mine = rollout.collect(TASK, Policy(**fields), 2, key=jax.random.key(1))
     assert same(alone, mine)
     assert hasty.number == 1
@@ -163,10 +245,8 @@ def test_outside_the_block_this_process_plays_alone():
     with players.using(2):
         assert players._CURRENT.players.number == 2
         with players.using(1):
-            assert players._CURRENT.players is None
+            assert players._CURRENT.players.number == 1
         assert players._CURRENT.players.number == 2
-    assert players._CURRENT.players is None
+    assert players._CURRENT.players.number == 1
     with players.using(None):
-        several = len(processes.cores()) > 1
-        assert (players._CURRENT.players is not None) == several
-    assert tree.size(draw(MLP(), (3, 1), 2, key=jax.random.key(0))) == 2
+        assert players._CURRENT.players.number == len(processes.cores())

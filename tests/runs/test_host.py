@@ -305,7 +305,7 @@ def test_metrics_with_other_names_are_refused(tmp_path, monkeypatch):
         return state, metrics | ({"late": 1.0} if int(metrics["position"]) > 10 else {})
 
     monkeypatch.setattr(Climber, "generation", changing)
-    with pytest.raises(ValueError, match=r"metrics .*late, position, but .*metrics\.csv has"):
+    with pytest.raises(ValueError, match=r"metrics .*late, position, but .*metrics\.csv, have"):
         train(tmp_path / "run")
 
 

@@ -39,7 +39,7 @@ from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.mlp import MLP
 from ..networks.team import Team, TeamPolicy
 from ..normalization import Moments, behind, frozen, play
-from ..rollout import Environment, evaluate
+from ..rollout import Environment, score
 from ..types import Metrics
 from .criticism import Criticism, judged
 from .fitness import objective
@@ -164,18 +164,18 @@ class CCEA(eqx.Module):
         # 9-21: for each population: rank, keep the elites, select, mutate; now and then extinction.
         best = jnp.argmax(rankable(fitness), axis=1)
         champion = behind(state.moments, drafted(self, state.populations, best[:, None]))
+        champion = tree.take(champion, 0)
         populations = breed(self, state.populations, fitness, key=breed_key)
 
-        test = evaluate(self.env, champion, self.test_episodes, key=test_key)
-        returns = played.of(self.reward)
+        returns, tested = played.of(self.reward), {"before": jnp.nan, "key": test_key}
         metrics |= {
             "fitness_max": jnp.max(rankable(jnp.mean(returns, axis=1))),
             "fitness_mean": jnp.nanmean(returns),
             "fitness_nan": jnp.sum(jnp.isnan(jnp.mean(returns, axis=1))),
-            "champion_score": jnp.mean(test.of(self.env.reported)),
+            "champion_score": score(self.env, champion, self.test_episodes, **tested),
             "frames": jnp.sum(played.steps),
         }
-        return CCEAState(populations, tree.take(champion, 0), moments, criticised), metrics
+        return CCEAState(populations, champion, moments, criticised), metrics
 
     def drawn(self, *, key: PRNGKeyArray) -> Members:
         """Who is in which team."""

@@ -4,10 +4,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .. import require, rollout, tree
+from .. import require, tree
 from ..compilation import when
 from ..networks.base import AbstractPolicy
-from ..rollout import Environment
+from ..rollout import Environment, score
 
 
 def objective(env: Environment, named: str | None = None) -> str:
@@ -20,10 +20,10 @@ def objective(env: Environment, named: str | None = None) -> str:
     return named or env.signals[0]
 
 
-def retested(env, champion: AbstractPolicy, episodes: int, due, score, *, key) -> Array:
-    """The champion's mean return on fresh episodes if a test is `due`, else the `score` from
-    before."""
-    return when(due, lambda: rollout.score(env, champion, episodes, key=key), lambda: score)
+def retested(env, champion: AbstractPolicy, episodes: int, due, before, *, key) -> Array:
+    """The champion's mean return on fresh episodes if a test is `due`, else the score from
+    `before`. No decision of a generation may depend on it (see `rollout.score`)."""
+    return when(due, lambda: score(env, champion, episodes, before=before, key=key), lambda: before)
 
 
 class Parsimony(eqx.Module):

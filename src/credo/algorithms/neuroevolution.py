@@ -35,8 +35,8 @@ from ..evolution.mutation import MatrixMutation
 from ..evolution.selection import rankable, ranking
 from ..networks.base import AbstractNetwork
 from ..networks.mmu import MMU
-from ..normalization import Moments, behind, frozen, play
-from ..rollout import Environment, evaluate
+from ..normalization import Moments, frozen, play
+from ..rollout import Environment, score
 from ..types import Evaluation, Metrics
 from .fitness import Parsimony, objective
 
@@ -189,21 +189,19 @@ class Neuroevolution(eqx.Module):
         bred, record, age, breeding = breed(self, state, fitness, key=breed_key)
 
         # The network with the highest fitness is tested on fresh episodes of the whole task.
-        champion = behind(state.moments, tree.take(population, order[:1]))
-        test = evaluate(self.env, champion, self.test_episodes, key=test_key)
-        score = self.score or self.env.reported
+        champion = frozen(state.moments, tree.take(population, order[0]))
+        reward, tested = self.score or self.env.reported, {"before": jnp.nan, "key": test_key}
         metrics = {
             "fitness_max": jnp.max(rankable(fitness)),
             "fitness_mean": jnp.nanmean(returns),
             "fitness_nan": jnp.sum(jnp.isnan(returns)),
-            "champion_score": jnp.mean(test.of(score)),
+            "champion_score": score(self.env, champion, self.test_episodes, reward, **tested),
             "frames": jnp.sum(evaluation.steps),
         }
         level = state.level
         if self.curriculum:
             metrics["level"] = level
-            level = self.curriculum.next(level, jnp.mean(evaluation.of(score)[order[0]]))
-        champion = tree.take(champion, 0)
+            level = self.curriculum.next(level, jnp.mean(evaluation.of(reward)[order[0]]))
         after = NeuroevolutionState(bred, champion, record, age, level, moments, breeding)
         return after, metrics
 

@@ -192,7 +192,7 @@ class OffPolicy(eqx.Module):
         # Test the actor without noise, now and then.
         actor = frozen(moments, self.learner.actor(learner))
         due = frames // self.test_every > state.frames // self.test_every
-        due = due | ~jnp.isfinite(state.score)
+        due = due | (state.score == -jnp.inf)
         score = retested(self.env, actor, self.test_episodes, due, state.score, key=test_key)
         returns = played.of(reward)
         metrics |= {

@@ -174,7 +174,7 @@ class PPO(eqx.Module):
 
         # Test the policy without noise, now and then.
         due = frames // self.test_every > state.frames // self.test_every
-        due = due | ~jnp.isfinite(state.score)
+        due = due | (state.score == -jnp.inf)
         score = retested(self.env, champion, self.test_episodes, due, state.score, key=test_key)
         returns = played.returns[objective(self.env, self.signal)][0]
         length = new.astype(jnp.float32) / wanted.astype(jnp.float32)

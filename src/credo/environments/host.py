@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Shaped, UInt32
+from jaxtyping import Bool, Float, Int, Shaped, UInt32
 
 from .base import AbstractTask
 
@@ -184,21 +184,30 @@ class AbstractHostEnvironment(AbstractTask):
 
 class Episodes:
     """One episode of each of `n` copies, as it is played: its length, its returns by reward and,
-    if they are recorded, its transitions. Played in turn, each turn is `begin` and then `advance`
-    while it is `ongoing`. Those that last longer than a `limit` are cut short.
+    of those that are to `record`, its transitions. Played in turn, each turn is `begin` and then
+    `advance` while it is `ongoing`. Those that last longer than their `limit` are cut short.
 
     An episode is lost, with a return of NaN and no transitions, if it failed or if its policy said
-    NaN or inf.
+    NaN or inf. `active`: whose episode is under way.
     """
 
-    def __init__(self, env: AbstractHostEnvironment, n: int, record: bool, limit: Any = None):
-        self.ongoing, most = False, env.max_steps
-        self._most = most if limit is None else min(int(limit), most)
+    def __init__(
+        self,
+        env: AbstractHostEnvironment,
+        n: int,
+        record: Bool[np.ndarray, " n"] | bool,
+        limit: Int[np.ndarray, " n"] | None = None,
+    ):
+        self.ongoing, self.active, most = False, np.zeros(n, bool), env.max_steps
+        self._limits = np.minimum(np.full(n, most) if limit is None else limit, most)
+        self._least, self._most = int(self._limits.min()), int(self._limits.max())
         self.steps = np.zeros(n, np.int32)
-        self._env, self._copies, self._record = env, env.copies(n), record
+        self._env, self._copies = env, env.copies(n)
+        self._record = np.broadcast_to(record, n)
+        self._records = bool(self._record.any())
         self._lost = np.zeros(n, bool)
         self._sums = {name: np.zeros((n, *shape)) for name, shape in env.reward_shapes.items()}
-        self._turns: list[tuple[np.ndarray, ...]] = []
+        self._turns: list[tuple[np.ndarray, tuple[Any, ...]]] = []
 
     def begin(self, seeds: UInt32[np.ndarray, " n"], turn: Bool[np.ndarray, " n"]) -> np.ndarray:
         """Start the episodes of a turn: their first observations, `[n, ...]`."""
@@ -206,33 +215,37 @@ class Episodes:
         if self._env.agents is not None:
             self._acting = np.ones((turn.size, self._env.agents), bool)
         self._obs = self._copies.reset(seeds, turn)
-        self._active = self._less(turn, self._copies.failed)
-        self._rows, self._valid, self._left = [], [], self._most
+        self.active = self._less(turn, self._copies.failed)
+        self._rows, self._valid, self._done = [], [], 0
         self.ongoing = True
         return self._obs
 
     def advance(self, actions: Float[np.ndarray, "n *agents act"]) -> np.ndarray:
         """One step of the turn: the next observations."""
-        nan, active = ~np.isfinite(actions), self._active
-        self._lost |= active & nan.reshape(active.size, -1).any(axis=1)
-        actions = np.where(nan, np.float32(0.0), actions)
-        now = self._copies.step(actions, active)
+        active, finite = self.active, np.isfinite(actions)
+        if not finite.all():
+            self._lost |= active & ~finite.reshape(active.size, -1).all(axis=1)
+            actions = np.where(finite, actions, np.float32(0.0))
+        now, everyone = self._copies.step(actions, active), active.all()
         for name, reward in now.rewards.items():
-            lanes = active.reshape(-1, *[1] * (reward.ndim - 1))
-            self._sums[name] += np.where(lanes, reward, 0.0)
+            if not everyone:
+                lanes = active.reshape(-1, *[1] * (reward.ndim - 1))
+                reward = np.where(lanes, reward, 0.0)
+            self._sums[name] += reward
         self.steps += active
+        self._done += 1
         over = now.truncated
-        if self._left == 1 and self._most < self._env.max_steps:
-            over = over | ~now.terminated
-        if self._record:
+        if self._least <= self._done < self._env.max_steps:
+            over = over | ((self._limits <= self._done) & ~now.terminated)
+        if self._records:
             ends = (now.ended, over, self._acting)
             self._rows.append((self._obs, actions, now.rewards, now.obs, *ends))
-            self._valid.append(active)
+            self._valid.append(active & self._record)
         active = self._less(active, now.failed)
-        self._active = active & ~(now.terminated | over)
-        self._obs, self._acting, self._left = now.obs, now.active, self._left - 1
-        self.ongoing = bool(self._left and self._active.any())
-        if self._record and not self.ongoing:
+        self.active = active & ~(now.terminated | over)
+        self._obs, self._acting = now.obs, now.active
+        self.ongoing = bool(self._done < self._most and self.active.any())
+        if self._records and not self.ongoing:
             self._turns.append(self._kept())
         return self._obs
 
@@ -243,15 +256,16 @@ class Episodes:
         self._lost |= active & failed
         return active & ~failed
 
-    def _kept(self) -> tuple[Any, ...]:
-        """The rows of a turn, episode by episode, as learners see them."""
+    def _kept(self) -> tuple[np.ndarray, tuple[Any, ...]]:
+        """How many rows of a turn are of each copy; and the rows, episode by episode, as learners
+        see them."""
         valid = np.stack(self._valid, axis=1) & ~self._lost[:, None]
 
         def kept(*steps: np.ndarray) -> np.ndarray:
             x = np.stack(steps, axis=1)[valid]
             return x.astype(np.float32) if x.dtype == np.float64 else x
 
-        return jax.tree.map(kept, *self._rows)
+        return valid.sum(axis=1), jax.tree.map(kept, *self._rows)
 
     def returns(self) -> dict[str, Float[np.ndarray, "n *agents"]]:
         """Sum of every reward in each episode; NaN of one that is lost."""
@@ -259,8 +273,11 @@ class Episodes:
             total[self._lost] = np.nan
         return self._sums
 
-    def rows(self) -> tuple[Any, ...]:
-        """The fields of a `Transition`, all episodes one behind the other."""
-        if len(self._turns) == 1:
-            return self._turns[0]
-        return jax.tree.map(lambda *turns: np.concatenate(turns), *self._turns)
+    def rows(self, lanes: slice = slice(None)) -> tuple[Any, ...]:
+        """The fields of a `Transition`, all episodes of some copies one behind the other, turn by
+        turn."""
+        turns = []
+        for counts, rows in self._turns:
+            before, mine = counts[: lanes.start or 0].sum(), counts[lanes].sum()
+            turns.append(jax.tree.map(lambda x, a=before, n=mine: x[a : a + n], rows))
+        return turns[0] if len(turns) == 1 else jax.tree.map(lambda *xs: np.concatenate(xs), *turns)

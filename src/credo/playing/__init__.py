@@ -46,33 +46,82 @@ class Outcome:
     rows: tuple[Any, ...] | None
     """The fields of a `Transition`, one episode behind the other, member by member; None if they
     were not recorded."""
-    endings: list[str] = dataclasses.field(default_factory=list)
-    """Of episodes whose failures are judged elsewhere: "", or why one failed."""
 
 
-def play(part: Part) -> Outcome:
-    """Play it here."""
-    shape = part.worlds.shape
-    form, arrays = apart(part.population)
-    first = start(form, arrays, jnp.asarray(part.policies))
-    told = Episodes(part.env, part.worlds.size, part.record, part.limit)
-    for turn in part.env.turns(np.tile(np.arange(shape[1]) < part.wanted, shape[0])):
-        obs, carry = told.begin(part.worlds.reshape(-1), turn), first
+class _Group:
+    """A part as it is played beside others: its policies, and which of all lanes are theirs."""
+
+    def __init__(self, part: Part, first: int):
+        self.lanes = slice(first, first + part.worlds.size)
+        self._form, self._arrays = apart(part.population)
+        self._start = start(self._form, self._arrays, jnp.asarray(part.policies))
+        _, actions, *team = part.env.sizes
+        self._idle = np.zeros((part.worlds.size, *team, actions), np.float32)
+        self.begin()
+
+    def begin(self) -> None:
+        """The memories with which a turn begins."""
+        self._carry = self._start
+
+    def act(self, obs: np.ndarray, active: np.ndarray) -> Any:
+        """Actions of its lanes, which may still be under way; zeros where none is active."""
+        if not active[self.lanes].any():
+            return self._idle
+        action, self._carry = act(self._form, self._arrays, obs[self.lanes], self._carry)
+        return action
+
+
+def play(parts: Sequence[Part]) -> list[Outcome]:
+    """Play parts of one task here. All take each step together, so that it is asked once."""
+    env, sizes = parts[0].env, [part.worlds.size for part in parts]
+    groups = [_Group(part, sum(sizes[:i])) for i, part in enumerate(parts)]
+    record = np.repeat([part.record for part in parts], sizes)
+    limits = [env.max_steps if part.limit is None else part.limit for part in parts]
+    told = Episodes(env, sum(sizes), record, np.repeat(limits, sizes))
+    wanted = [np.tile(np.arange(p.worlds.shape[1]) < p.wanted, len(p.worlds)) for p in parts]
+    for turn in env.turns(np.concatenate(wanted)):
+        obs = told.begin(np.concatenate([part.worlds.reshape(-1) for part in parts]), turn)
+        for group in groups:
+            group.begin()
         while told.ongoing:
-            action, carry = act(form, arrays, obs, carry)
-            obs = told.advance(np.asarray(action))
-    returns = {name: x.reshape(*shape, *x.shape[1:]) for name, x in told.returns().items()}
-    rows = told.rows() if part.record else None
-    return Outcome(returns, told.steps.reshape(shape), rows)
+            actions = [group.act(obs, told.active) for group in groups]
+            obs = told.advance(np.concatenate(actions) if len(groups) > 1 else np.asarray(*actions))
+    return [_outcome(part, told, group.lanes) for part, group in zip(parts, groups, strict=True)]
 
 
-def split(part: Part, most: int) -> list[Part]:
-    """The same in at most so many parts, of two members or more: a lone member would be computed by
-    another program, that may differ in the last bit."""
-    members = len(part.worlds)
-    number = max(1, min(most, members // 2))
-    ends = [members * (i + 1) // number for i in range(number)]
-    return [_some(part, slice(a, b)) for a, b in zip([0, *ends], ends, strict=False)]
+def _outcome(part: Part, told: Episodes, lanes: slice) -> Outcome:
+    """What came of some lanes."""
+    shape = part.worlds.shape
+    returns = {name: x[lanes].reshape(*shape, *x.shape[1:]) for name, x in told.returns().items()}
+    rows = told.rows(lanes) if part.record else None
+    return Outcome(returns, told.steps[lanes].reshape(shape), rows)
+
+
+Share = list[tuple[int, Part]]
+"""What one process plays: slices of parts, by the number of the part."""
+
+
+def shared(parts: Sequence[Part], most: int) -> list[Share]:
+    """Parts shared out among at most so many processes, about as many episodes to each.
+
+    A population is cut between its members, two or more to a slice: a lone member would be computed
+    by another program, that may differ in the last bit. A single policy is played by one process.
+    """
+    load, shares = [0] * most, list[Share]([] for _ in range(most))
+    for i, part in sorted(
+        enumerate(parts), key=lambda x: (len(x[1].worlds) > 1, -x[1].worlds.size)
+    ):
+        members, episodes = part.worlds.shape
+        counts = [0] * most
+        for unit in [2] * (members // 2 - 1) + [2 + members % 2] if members > 1 else [1]:
+            least = load.index(min(load))
+            counts[least] += unit
+            load[least] += unit * episodes
+        for k, count in enumerate(counts):
+            done = sum(counts[:k])
+            if count:
+                shares[k].append((i, _some(part, slice(done, done + count))))
+    return [share for share in shares if share]
 
 
 def _some(part: Part, members: slice) -> Part:
@@ -82,13 +131,11 @@ def _some(part: Part, members: slice) -> Part:
 
 
 def joined(outcomes: Sequence[Outcome]) -> Outcome:
-    """The parts of one again, in order."""
+    """The slices of one part again, in order."""
     if len(outcomes) == 1:
         return outcomes[0]
     parts = [(x.returns, x.steps, x.rows) for x in outcomes]
-    endings = [why for x in outcomes for why in x.endings]
-    returns, steps, rows = jax.tree.map(lambda *xs: np.concatenate(xs), *parts)
-    return Outcome(returns, steps, rows, endings)
+    return Outcome(*jax.tree.map(lambda *xs: np.concatenate(xs), *parts))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,10 +1,9 @@
-"""A process that plays one part after another (see `players`): pickles in, pickles out, each behind
-its length. It computes on one core, and ends when its input does.
+"""A process that plays one share after another (see `players`): pickles in, pickles out, each
+behind its length. It computes on one core, and ends when its input does.
 
 What it reads is from the process that started it, and what it writes is read by that one alone.
 """
 
-import dataclasses
 import os
 import pickle
 import struct
@@ -17,7 +16,7 @@ LENGTH = struct.Struct("=Q")
 
 
 def main() -> None:
-    """Play parts until there are none."""
+    """Play shares until there are none."""
     processes.settle()
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever prints must not look like an answer
@@ -36,20 +35,20 @@ def main() -> None:
 
 
 def _answer(body: bytes) -> tuple[str, Any]:
-    """An outcome, or in words what was raised."""
+    """The outcomes of some parts and how their episodes ended, or in words what was raised."""
     from ..environments import foreign
     from ..environments.host import EnvironmentFailure
     from . import play
 
     try:
-        part, what = pickle.loads(body)
-        foreign.know(part.env, what)
+        parts, what = pickle.loads(body)
+        foreign.know(parts[0].env, what)
     except Exception as error:  # a class of the user's script, which this process did not run
         return "unknown", f"{type(error).__name__}: {error}"
     try:
-        told = foreign.tally(part.env)
+        told = foreign.tally(parts[0].env)
         told.news.clear()
-        return "outcome", dataclasses.replace(play(part), endings=told.news)
+        return "outcome", (play(parts), told.news)
     except EnvironmentFailure as error:
         return "failure", str(error)
     except Exception as error:  # the parent reports it

@@ -220,12 +220,14 @@ def _text(value: float | int) -> str:
 
 def _append(path: pathlib.Path, rows: Sequence[Row]) -> bytes:
     """Write rows behind a table, or as a new one; what was written."""
-    names, header, text = list(rows[0]), _header(path), io.StringIO()
-    if header not in (None, names):
-        raise ValueError(
-            f"a generation has the metrics {', '.join(names)}, but {path} has "
-            f"{', '.join(header)}: they must be the same in every generation"
-        )
+    header, text = _header(path), io.StringIO()
+    names = header or list(rows[0])
+    for row in rows:
+        if list(row) != names:
+            raise ValueError(
+                f"a generation has the metrics {', '.join(row)}, but those before it, in {path}, "
+                f"have {', '.join(names)}: they must be the same in every generation"
+            )
     table = csv.writer(text, lineterminator="\n")
     table.writerows([] if header else [names])
     table.writerows(map(_text, row.values()) for row in rows)

@@ -16,7 +16,7 @@ import json
 import pathlib
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from .. import compilation
+from .. import compilation, rollout
 from ..compilation import jit
 from ..environments import processes
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
@@ -45,6 +45,7 @@ from .trust import seal, short, signed_here
 
 CHUNK = 64  # generations in one dispatch, at most
 DISPATCH = 0.3  # seconds that one dispatch should last
+PATIENCE = 10.0  # seconds after which one outside JAX ends with its generation
 MOST = 2**31 - 1  # what 32 bits hold
 
 
@@ -383,7 +384,8 @@ class _Training:
     - `state`, `best`: donated to every dispatch, so nothing else may hold them.
     - `reached`: which limit of the budget was reached, in words; `ended`: why else it is to end.
     - `chunk`: generations that the next dispatch may hold, at most `CHUNK`.
-    - `began`, `last_save`: seconds of the monotonic clock; `before`: seconds of training before.
+    - `began`, `last_save`, `tick`: the clock at the start, at the newest checkpoint and dispatch;
+      `before`: seconds of training before.
     """
 
     def __init__(
@@ -402,17 +404,19 @@ class _Training:
         self.journal = log.Log(run.path, self.generation)
         score = float(log.last(run.path / log.METRICS).get("champion_score", -np.inf))
         self.reached = self.budget.reached(self.generation, self.frames, score)
+        self.signals = Signals()
         every = getattr(algorithm, "test_every", 1) == 1
         arrays, stale = eqx.filter(saved.state.champion, eqx.is_array), NOTHING if every else score
         self.state, self.best = saved.state, saved.extra or Best.none(arrays, stale)
         self.listeners = callbacks.Listeners(run, heard, score, every)
         self.ended = ""  # why, if neither the budget nor a signal is
         self.bar = Progress(run.path, self.generation, self.frames, self.budget, options.progress)
-        self.began = self.last_save = time.monotonic()
+        self.began = self.last_save = self.tick = time.monotonic()
         self.before = self.journal.elapsed
 
     def go_on(self, signals: Signals) -> str:
         """Train, save, and say why it ended (see `Callback.on_end`)."""
+        self.signals = signals
         if self.reached:
             told = f"is finished: {self.reached}; to go on give a larger --generations or --frames"
             self.bar.say(told)
@@ -447,11 +451,11 @@ class _Training:
         Raises `RunError` if weights are no numbers any more or a task outside JAX failed, and
         `OSError` or `CheckpointError` if the disk did.
         """
-        tick = time.monotonic()
+        self.tick = time.monotonic()
         rows = self.play()
         self.require_sound()
         now = time.monotonic()
-        seconds = now - tick
+        seconds = now - self.tick
         self.journal.append(rows, seconds, self.before + now - self.began)
         self.bar.update(self.generation, rows[-1], seconds)
         limit = self.options.wall_clock
@@ -470,9 +474,13 @@ class _Training:
 
     def play(self) -> list[dict[str, Any]]:
         """The next generations; a row of metrics for each."""
-        at = (self.root, self.generation, self.frames, self.chunk, self.budget)
+        at = (self.algorithm, self.state, self.best, self.root, self.generation, self.frames)
         try:
-            self.state, self.best, rows = play(self.algorithm, self.state, self.best, *at)
+            if isinstance(self.algorithm.env, AbstractHostEnvironment):
+                played = play_outside(*at, self.budget, self.enough)
+            else:
+                played = play(*at, self.chunk, self.budget)
+            self.state, self.best, rows = played
         except EnvironmentFailure as failure:
             # The state was donated: what is on disk is all there is.
             raise RunError(
@@ -481,6 +489,19 @@ class _Training:
             ) from failure
         self.generation, self.frames = rows[-1]["generation"], rows[-1]["frames"]
         return rows
+
+    def enough(self) -> bool:
+        """Whether a dispatch outside JAX is to end with the generation that it has just played."""
+        now, limit = time.monotonic(), self.options.wall_clock
+        since = now - max(self.tick, self.last_save)
+        return (
+            self.signals.received > 0
+            or now - self.tick >= PATIENCE
+            or since >= self.options.checkpoint_every
+            or (limit is not None and now - self.began >= limit)
+            or self.budget.stop_at is not None
+            or bool(self.options.callbacks)  # each is to hear of a generation when it is over
+        )
 
     def require_sound(self) -> None:
         """End a training whose weights are no numbers: nothing can be learned from there."""
@@ -538,32 +559,86 @@ def play(
     n: int,
     budget: Budget,
 ) -> tuple[PyTree, Best, list[dict[str, Any]]]:
-    """The next generations, at most `n` and `CHUNK`, none beyond the budget; one if the task lies
-    outside JAX. `state` and `best` are used up.
+    """The next generations of a task in JAX, at most `n` and `CHUNK`, none beyond the budget.
+    `state` and `best` are used up.
 
     **Returns:** the state, the best policy so far, and a row of metrics, in Python numbers, for
     each generation.
     """
-    if isinstance(algorithm.env, AbstractHostEnvironment):
-        state, metrics = algorithm.generation(state, key=jax.random.fold_in(root, generation + 1))
-        columns, count = jax.tree.map(lambda x: np.asarray(x)[None], metrics), 1
-        score = columns["champion_score"][0]
-        if best.beaten(score):
-            arrays = Best.none(eqx.filter(state.champion, eqx.is_array)).policy
-            best = Best(arrays, score, np.int32(generation + 1), best.stale)  # pyright: ignore[reportArgumentType]
-    else:
-        n = min(n, CHUNK, (budget.generations or MOST) - generation)
-        left = MOST if budget.frames is None else min(budget.frames - frames, MOST)
-        numbers = (np.int32(generation), np.int32(n), np.int32(left), budget.stop_score)
-        state, best, count, metrics = advance((algorithm, root, *numbers), state, best)
-        columns = jax.tree.map(np.asarray, metrics)
-    rows = []
+    n = min(n, CHUNK, (budget.generations or MOST) - generation)
+    left = MOST if budget.frames is None else min(budget.frames - frames, MOST)
+    numbers = (np.int32(generation), np.int32(n), np.int32(left), budget.stop_score)
+    state, best, count, metrics = advance((algorithm, root, *numbers), state, best)
+    columns, rows = jax.tree.map(np.asarray, metrics), []
     for i in range(int(count)):
-        row = {name: column[i].item() for name, column in columns.items()}
-        row = {name: np.nan if value == NOTHING else value for name, value in row.items()}
+        row = _row({name: column[i] for name, column in columns.items()})
         frames += int(row.pop("frames"))
         rows.append({"generation": generation + i + 1, "frames": frames, **row})
     return state, best, rows
+
+
+def _row(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Metrics of a generation in Python numbers."""
+    row = {name: np.asarray(value).item() for name, value in sorted(metrics.items())}
+    return {name: np.nan if value == NOTHING else value for name, value in row.items()}
+
+
+def play_outside(
+    algorithm: Any,
+    state: PyTree,
+    best: Best,
+    root: PRNGKeyArray,
+    generation: int,
+    frames: int,
+    budget: Budget,
+    enough: Callable[[], bool],
+) -> tuple[PyTree, Best, list[dict[str, Any]]]:
+    """`play` of a task outside JAX: generations until one is `enough` or the budget is reached.
+
+    The test of each champion is played beside the next generation's episodes, so its score is put
+    into its row, and into the state, one generation late (`rollout.score`); that of the last
+    one is waited for. How many generations one call holds changes no number of any.
+    """
+    rows: list[dict[str, Any]] = []
+    waiting: tuple[rollout.Postponed, PyTree] | None = None  # a test and the arrays it is of
+
+    def settle(state: PyTree, best: Best, which: slice) -> tuple[PyTree, Best]:
+        """With the score of the test that was waited for, of these rows."""
+        assert waiting is not None
+        score = waiting[0].score()
+        for row in rows[which]:
+            row["champion_score"] = _row({"score": score})["score"]
+        if hasattr(state, "score"):  # for generations that repeat it
+            state = eqx.tree_at(lambda state: state.score, state, score)
+        number = rows[which][0]["generation"]
+        return state, _better(best, np.asarray(score), waiting[1], number)
+
+    while not rows or not (enough() or budget.reached(generation, frames)):
+        generation += 1
+        with rollout.postponing() as postponed:
+            key = jax.random.fold_in(root, generation)
+            state, metrics = algorithm.generation(state, key=key)
+        row = _row(metrics)
+        frames += int(row.pop("frames"))
+        rows.append({"generation": generation, "frames": frames, **row})
+        if waiting is not None:
+            # A generation that made no test of its own repeats the score.
+            state, best = settle(state, best, slice(-2, -1 if postponed else None))
+            waiting = None
+        arrays = Best.none(eqx.filter(state.champion, eqx.is_array)).policy
+        if postponed:
+            waiting = postponed[-1], arrays
+        else:
+            best = _better(best, np.asarray(metrics["champion_score"]), arrays, generation)
+    if waiting is not None:
+        state, best = settle(state, best, slice(-1, None))
+    return state, best, rows
+
+
+def _better(best: Best, score: Any, arrays: PyTree, generation: int) -> Best:
+    """The best policy, where a champion has been tested."""
+    number: Any = np.int32(generation)
+    return Best(arrays, score, number, best.stale) if best.beaten(score) else best
 
 
 @jit(donate="all-except-first")
