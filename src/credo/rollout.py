@@ -114,22 +114,36 @@ def collect(
     population: PyTree,
     episodes: int,
     *,
-    wanted: Int[Array, ""] | int | None = None,
-    common: bool = True,
-    limit: Int[Array, ""] | None = None,
-    key: PRNGKeyArray,
+    wanted=None,
+    common=True,
+    limit=None,
+    key,
 ) -> tuple[Evaluation, Experience]:
     """`evaluate`, and every transition that was met. Outside JAX a finished episode costs no more
     physics; in JAX all lanes step until the last one ends.
 
-    **Arguments:** of its `episodes` each member plays the first `wanted`; that number is data.
-    The others have no steps and a return of 0. Episodes are truncated after `limit` steps, which is
-    data too; None: when the task ends them.
+    **Arguments:** of its `episodes` each member plays the first `wanted`, None: all; that number is
+    data. The others have no steps and a return of 0. Episodes are truncated after `limit` steps,
+    which is data too; None: when the task ends them.
     """
     wanted = episodes if wanted is None else wanted
     if isinstance(env, AbstractHostEnvironment):
         return _play_on_host(env, population, episodes, wanted, common, True, limit, key=key)
     return _play(env, _lanes(population, episodes, common, key=key), jnp.int32(wanted), True, limit)
+
+
+@float32()
+def begun(
+    env: Environment, population: PyTree, episodes: int, *, wanted=None, common=True, key
+) -> Callable[[], tuple[Evaluation, Experience]]:
+    """`collect` of what is wanted later: call it for the result. Outside JAX nothing is played
+    before that, unless `playing.players.start` lets other processes begin."""
+    if not isinstance(env, AbstractHostEnvironment):
+        found = collect(env, population, episodes, wanted=wanted, common=common, key=key)
+        return lambda: found
+    wanted = episodes if wanted is None else wanted
+    asked = players.ask(_part(env, population, episodes, wanted, common, True, key=key))
+    return lambda: _told(asked.result())
 
 
 @float32()
@@ -315,12 +329,10 @@ def _play(
 
     *_, (returns, steps, lost), rows = jax.lax.while_loop(ongoing, advance, start)
     returns = jax.tree.map(lambda x: jnp.where(_over(lost, x), jnp.nan, x), returns)
-    if not record:
-        return Evaluation(returns, steps), None
     # Episode by episode, as they would be met one after the other.
-    kept = (rows[0], rows[1] & ~lost[None])
+    kept = rows and (rows[0], rows[1] & ~lost[None])
     flat = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2).reshape(-1, *x.shape[3:]), kept)
-    return Evaluation(returns, steps), Experience(*flat)
+    return Evaluation(returns, steps), flat and Experience(*flat)
 
 
 def _sound(x: Array) -> Bool[Array, "pop episodes"]:
@@ -390,7 +402,11 @@ def _play_on_host(
 ) -> tuple[Evaluation, Any]:
     """The same with copies outside JAX: actions go there and time steps come back, once per step
     for all lanes together. `how`: arguments of `_part`."""
-    came = players.ask(_part(env, population, *how, key=key)).result()
+    return _told(players.ask(_part(env, population, *how, key=key)).result())
+
+
+def _told(came: playing.Outcome) -> tuple[Evaluation, Any]:
+    """An outcome as `evaluate` and `collect` say it."""
     rows = None if came.rows is None else Experience(Transition(*came.rows), None)
     return _evaluated(came), rows
 

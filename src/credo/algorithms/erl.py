@@ -54,6 +54,7 @@ from ..rollout import Environment
 from ..types import Metrics
 from .aid import coached, play_ahead, preselect
 from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
+from .overlap import overlapped
 
 TABLE_5_1 = {  # task: (ψ, ξ, ω)
     "HalfCheetah": (0.1, 1, 10),
@@ -118,6 +119,9 @@ class ERL(Hybrid):
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Policies see observations normalised by the running mean and variance of all observations so
     far; the champion keeps them."""
+    overlap: bool = eqx.field(static=True, default=False)
+    """Learners learn from what was played up to the generation before, while this one is played;
+    of tasks outside JAX at the same time, in other processes. False: after it, from all of it."""
 
     def __check_init__(self):
         require.at_least("sync_period", self.sync_period, 1)
@@ -192,8 +196,13 @@ class ERL(Hybrid):
         """One pass of the outer loop of Algorithms 6 and 10."""
         play_key, breed_key, explore_key, learn_key, manage_key, test_key = jax.random.split(key, 6)
         # 6-7: for actor in pop: fitness, R = Evaluate(actor, R, noise=None, ξ)
-        playing = play if self.horizon is None else play_ahead
-        state, played = playing(self, state, state.population, self.episodes, key=play_key)
+        if self.overlap:  # and what lines 16-29 say, meanwhile
+            state, played, learned = overlapped(
+                self, state, keys=(play_key, explore_key, learn_key)
+            )
+        else:
+            playing = play if self.horizon is None else play_ahead
+            state, played = playing(self, state, state.population, self.episodes, key=play_key)
         fitness = jnp.mean(played.of(self.reward), axis=1)
 
         if self.share is not None:
@@ -205,7 +214,10 @@ class ERL(Hybrid):
 
         # 16-29: learners play too, with noise, and their mean return is their value; then as many
         # updates as frames, each learner on minibatches of its own.
-        state, learned = teach(self, state, jnp.sum(played.steps), keys=(explore_key, learn_key))
+        if not self.overlap:
+            state, learned = teach(
+                self, state, jnp.sum(played.steps), keys=(explore_key, learn_key)
+            )
 
         # 30-33: allocate the workers of the next generation.
         if self.manager is not None and self.learners:

@@ -62,6 +62,7 @@ class HybridState(eqx.Module):
     generation: Int[Array, ""] = _field(0, jnp.int32)
     learned: Bool[Array, ""] = _field(False, jnp.bool_)  # whether the learners ever did
     breeding: PyTree = None  # what the breeder remembers
+    owed: Any = None  # frames of the last generation that nobody learned from yet, with `overlap`
 
 
 class Hybrid(eqx.Module):
@@ -89,6 +90,7 @@ class Hybrid(eqx.Module):
     fitness: eqx.AbstractVar[str | None]
     remember: eqx.AbstractVar[bool]
     normalize_observations: eqx.AbstractVar[bool]
+    overlap: eqx.AbstractVar[bool]
 
     def __check_init__(self):
         for name in ("episodes", "workers", "replay_capacity", "test_episodes", "test_every"):
@@ -106,6 +108,8 @@ class Hybrid(eqx.Module):
             self.surrogate.check(self.breeder, self.learners)
         if self.horizon is not None:
             self.horizon.check(self.reward, self.redistribute, self.learners)
+        if self.overlap and (not q or self.share is not None or self.horizon is not None):
+            raise ValueError("overlap is for hybrids with learners, without a share and a horizon")
         if self.manager is None and self.workers < q:
             raise ValueError(
                 f"{self.workers} workers for {q} learners: some would never play; give at least as "
@@ -158,6 +162,7 @@ class Hybrid(eqx.Module):
             share=jnp.float32(self.share.first() if self.share else 0.0),
             breeding=breeding,
             known=self.redistribute and self._known(key=jax.random.fold_in(key, 1 + q)),
+            owed=jnp.int32(0) if self.overlap else None,
         )
 
     def _known(self, *, key: PRNGKeyArray) -> PyTree:
@@ -246,17 +251,27 @@ def explore(hybrid: Hybrid, state: HybridState, frames: Frames, *, key: Key) -> 
     **Returns:** the state, and as metrics which learner played how many episodes, its value, and
     the `frames` that were given and those that were played here.
     """
-    metrics, workers = {}, hybrid.workers
-    for i, learner in enumerate(hybrid.learners):
-        mine = jnp.sum((state.allocation == i).astype(jnp.int32))
-        team = tree.single(learner.explorer(state.learners[i], jnp.bool_(False)))
-        how = {"wanted": mine, "common": False, "key": jax.random.fold_in(key, i)}
-        state, played = play(hybrid, state, team, workers, **how)
-        returns, theirs = played.of(hybrid.reward)[0], jnp.arange(workers) < mine
-        ledger = (hybrid.manager or UNMANAGED).observe(state.ledger, i, returns, theirs)
-        state, frames = replace(state, ledger=ledger), frames + jnp.sum(played.steps)
-        metrics |= {f"workers_{i}": mine, f"value_{i}": ledger.value[i]}
+    metrics = {}
+    for i in range(len(hybrid.learners)):
+        team, how = exploring(hybrid, state, i, key=key)
+        state, played = play(hybrid, state, team, hybrid.workers, **how)
+        state, told = observed(hybrid, state, i, how["wanted"], played)
+        frames, metrics = frames + jnp.sum(played.steps), metrics | told
     return state, {"frames": frames} | metrics
+
+
+def exploring(hybrid: Hybrid, state: HybridState, i: int, *, key: Key):
+    """The exploration policy of learner i, and how its workers play."""
+    mine = jnp.sum((state.allocation == i).astype(jnp.int32))
+    team = tree.single(hybrid.learners[i].explorer(state.learners[i], jnp.bool_(False)))
+    return team, {"wanted": mine, "common": False, "key": jax.random.fold_in(key, i)}
+
+
+def observed(hybrid: Hybrid, state: HybridState, i: int, mine, played: Evaluation) -> Result:
+    """With what the first `mine` of the workers' episodes returned in the ledger."""
+    returns, theirs = played.of(hybrid.reward)[0], jnp.arange(hybrid.workers) < mine
+    ledger = (hybrid.manager or UNMANAGED).observe(state.ledger, i, returns, theirs)
+    return replace(state, ledger=ledger), {f"workers_{i}": mine, f"value_{i}": ledger.value[i]}
 
 
 def balance(hybrid: Hybrid, state: HybridState, fitness: Fitness) -> HybridState:
@@ -303,18 +318,17 @@ def improve(hybrid, state: HybridState, frames: Frames, episodes: int, *, key: K
     """Each learner makes `updates_per_frame` updates for each of some new `frames`, on minibatches
     of its own from the common buffer. The state counts these frames, and their `episodes`."""
     ready = (state.frames >= hybrid.warmup_frames) & bool(hybrid.learners)
-    due = jnp.where(ready, frames.astype(jnp.float32) * hybrid.updates_per_frame, 0.0)
-    learned, metrics, replay = [], {"updates": due.astype(jnp.int32)}, state.replay
+    due = jnp.int32(jnp.where(ready, frames.astype(jnp.float32) * hybrid.updates_per_frame, 0.0))
+    learned, metrics, replay = [], {"updates": due}, state.replay
     if hybrid.redistribute is not None and hybrid.learners:
         state, replay, metrics = _paid(hybrid, state, frames, metrics, key=key)
     how = {"signal": hybrid.reward, "moments": state.seen, "sampling": hybrid.sampling}
-    for i, learner in enumerate(hybrid.learners):
-        given = how | {"key": jax.random.fold_in(key, i)}
-        after, report = learn(learner, state.learners[i], replay, metrics["updates"], **given)
+    for i, (learner, own) in enumerate(zip(hybrid.learners, state.learners, strict=True)):
+        after, report = learn(learner, own, replay, due, key=jax.random.fold_in(key, i), **how)
         learned.append(after)
         metrics |= {f"{name}_{i}": value for name, value in report.items()}
     counted = {"frames": state.frames + frames, "episodes": state.episodes + episodes}
-    counted |= {"learned": state.learned | (metrics["updates"] > 0), "moments": state.seen}
+    counted |= {"learned": state.learned | (due > 0), "moments": state.seen}
     return replace(state, learners=tuple(learned), **counted), metrics
 
 

@@ -50,6 +50,7 @@ from ..types import Metrics
 from .aid import coached, play_ahead, preselect
 from .erl import BREEDER as ERL_BREEDER
 from .hybrid import Hybrid, HybridState, balance, breed, inject, play, teach, tested
+from .overlap import overlapped
 
 LOCAL = TD3(signal="local", **TEAM)
 """The learner of the team: one twin critic that all agents share (lines 2 and 16-21)."""
@@ -97,6 +98,9 @@ class MERL(Hybrid):
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Policies see observations normalised by the running mean and variance of all observations so
     far; the champion keeps them."""
+    overlap: bool = eqx.field(static=True, default=False)
+    """Learners learn from what was played up to the generation before, while this one is played;
+    of tasks outside JAX at the same time, in other processes. False: after it, from all of it."""
 
     def __check_init__(self):
         require.at_least("migration_period", self.migration_period, 1)
@@ -131,8 +135,13 @@ class MERL(Hybrid):
         """One pass of the outer loop of Algorithm 13."""
         rollout_key, breed_key, explore_key, learn_key, test_key = jax.random.split(key, 5)
         # 6-9: for team π: g, R = Rollout(π, R, noise=None, ξ); g is π's fitness.
-        playing = play if self.horizon is None else play_ahead
-        state, played = playing(self, state, state.population, self.episodes, key=rollout_key)
+        if self.overlap:  # and what lines 16-29 say, meanwhile
+            state, played, learned = overlapped(
+                self, state, keys=(rollout_key, explore_key, learn_key)
+            )
+        else:
+            playing = play if self.horizon is None else play_ahead
+            state, played = playing(self, state, state.population, self.episodes, key=rollout_key)
         fitness = jnp.mean(played.of(self.reward), axis=1)
 
         if self.share is not None:
@@ -145,7 +154,10 @@ class MERL(Hybrid):
         # 8: Rollout(π_pg, R, noise=W_g, ξ=1), in parallel worlds.
         # 15-21: for agent k: a minibatch from R^k; descend the critic's loss; follow the gradient
         # of Q with head k; move the targets.
-        state, learned = teach(self, state, jnp.sum(played.steps), keys=(explore_key, learn_key))
+        if not self.overlap:
+            state, learned = teach(
+                self, state, jnp.sum(played.steps), keys=(explore_key, learn_key)
+            )
 
         # 22: Migrate: the weakest teams become copies of π_pg.
         due = (state.generation % self.migration_period == 0) & (learned["updates"] > 0)

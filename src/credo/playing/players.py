@@ -51,8 +51,9 @@ class Asked:
 class Players:
     """Up to `number` processes, at least 1: with 1 this one plays all."""
 
-    def __init__(self, number: int, patience: float = PATIENCE):
-        self.number, self._patience, self._spent = number, patience, 0.0
+    def __init__(self, number: int, patience: float | None = None):
+        self.number, self._spent = number, 0.0
+        self._patience = PATIENCE if patience is None else patience
         self._all: list[_Player | None] = [None] * number
         self._waiting: list[weakref.ref[Asked]] = []
         self._away: _Batch | None = None  # what the processes play just now
