@@ -476,7 +476,7 @@ def test_of_a_folder_of_runs_one_must_be_named(credo, seeds, command):
 
 def test_every_run_of_a_folder_is_resumed(credo, seeds, monkeypatch):
     given = []
-    monkeypatch.setattr("credo.executors.local.run", lambda jobs, **_: given.extend(jobs))
+    monkeypatch.setattr("credo.executors.run", lambda jobs, **_: given.extend(jobs))
     assert credo(f"resume {seeds} --generations 20 --keep 2")[0] == 0
     assert [(job.path.name, job.seed) for job in given] == [("seed-3", 3), ("seed-11", 3)]
     told = [(job.options.generations, job.options.frames, job.options.keep) for job in given]
@@ -487,12 +487,24 @@ def test_every_run_of_a_folder_is_resumed(credo, seeds, monkeypatch):
     assert [job.finished() for job in given] == [True, True]
 
 
+@pytest.mark.parametrize(
+    "words", ["train neuroevolution sequence-recall", "resume some-run", "reproduce fig-3.4a"]
+)
+def test_a_place_that_there_is_not_is_refused(credo, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = credo(f"{words} --on locale")
+    assert (code, out) == (2, "")
+    told = "credo: --on is 'locale': runs are trained on local"
+    assert err.splitlines()[-1] == f"{told} (did you mean 'local'?)"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_resume_is_told_reaches_the_loop(credo, seeds, run, monkeypatch):
     told = []
     resumed = lambda path, options, **fields: told.append((path, fields | vars(options)))  # noqa: E731
     monkeypatch.setattr("credo.runs.loop.resume", resumed)
     given = lambda jobs, **_: told.extend((j.path, j.again | vars(j.options)) for j in jobs)  # noqa: E731
-    monkeypatch.setattr("credo.executors.local.run", given)
+    monkeypatch.setattr("credo.executors.run", given)
     words = "--set mutation.strength=0.5 --set episodes=5 --trust --without-replay --generations 20"
     assert credo(f"resume {run} {words} --wall-clock 2m")[0] == 0
     assert credo(f"resume {seeds} {words}")[0] == 0

@@ -13,11 +13,12 @@ import time
 import numpy as np
 import pytest
 
+from credo import executors
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments import processes
 from credo.environments.sequence_classification import SequenceClassification
 from credo.evolution.breeder import altered
-from credo.executors import local
+from credo.executors import Job, local
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.runs import config, loop
@@ -45,12 +46,12 @@ def trained(tmp_path_factory):
     """Three jobs, one of them impossible, by two workers; and what was said."""
     folder = tmp_path_factory.mktemp("jobs")
     jobs = [
-        local.Job(folder / "0", ALGORITHM, 0, FIVE),
-        local.Job(folder / "bad", IMPOSSIBLE, 0, FIVE),
-        local.Job(folder / "1", ALGORITHM, 1, FIVE),
+        Job(folder / "0", ALGORITHM, 0, FIVE),
+        Job(folder / "bad", IMPOSSIBLE, 0, FIVE),
+        Job(folder / "1", ALGORITHM, 1, FIVE),
     ]
     with pytest.raises(loop.RunError) as error:
-        local.run(jobs, workers=2)
+        executors.run(jobs, workers=2)
     return jobs, str(error.value)
 
 
@@ -78,7 +79,7 @@ def test_what_is_finished_is_not_run_again(trained, monkeypatch):
     (first, _, second), _ = trained
     started = []
     monkeypatch.setattr(local, "_start", lambda: started.append(1))
-    local.run([first, second], workers=2)
+    executors.run([first, second], workers=2)
     assert started == []
     longer = wanting(first, generations=6)
     assert not longer.finished()
@@ -110,7 +111,7 @@ def test_a_folder_with_another_run_is_refused(trained, changes, told):
     (first, *_), _ = trained
     before = (first.path / "config.json").read_bytes()
     with pytest.raises(loop.RunError, match=told):
-        local.run([dataclasses.replace(first, **changes)])
+        executors.run([dataclasses.replace(first, **changes)])
     assert (first.path / "config.json").read_bytes() == before
 
 
@@ -136,9 +137,9 @@ def test_a_process_that_dies_is_told_and_replaced(tmp_path, monkeypatch):
         return started[-1]
 
     monkeypatch.setattr(local, "_start", start)
-    jobs = [local.Job(tmp_path / str(seed), ALGORITHM, seed, FIVE) for seed in range(3)]
+    jobs = [Job(tmp_path / str(seed), ALGORITHM, seed, FIVE) for seed in range(3)]
     with pytest.raises(loop.RunError) as error:
-        local.run(jobs, workers=1)
+        executors.run(jobs, workers=1)
     assert str(error.value) == (
         f"1 of 3 runs failed:\n{jobs[0].path}: its process ended with exit code -9"
     )
@@ -152,15 +153,15 @@ def test_a_job_stopped_half_way_goes_on(trained, tmp_path):
     loop.train(ALGORITHM, generations=5, path=path, callbacks=(lambda *_: True,), **quiet)
     job = dataclasses.replace(first, path=path)
     assert not job.finished()
-    local.run([job])
+    executors.run([job])
     assert job.finished()
     assert (path / "metrics.csv").read_bytes() == (first.path / "metrics.csv").read_bytes()
 
 
 def test_what_the_clock_left_is_named_with_how_to_go_on(tmp_path, capsys):
     options = FIVE.changed({"generations": 10**6, "wall_clock": 0.0})
-    jobs = [local.Job(tmp_path / f"seed-{seed}", ALGORITHM, seed, options) for seed in range(2)]
-    local.run(jobs, workers=1)
+    jobs = [Job(tmp_path / f"seed-{seed}", ALGORITHM, seed, options) for seed in range(2)]
+    executors.run(jobs, workers=1)
     assert (
         "credo: 2 of 2 runs are not finished for want of time (seed-0 generation 1/1000000, seed-1 "
         "generation 1/1000000): go on with the same command"
@@ -172,21 +173,21 @@ def test_runs_go_on_with_another_setting_and_a_larger_budget(trained, tmp_path):
     paths = [shutil.copytree(job.path, tmp_path / job.path.name) for job in (first, second)]
     options = RunOptions(generations=7, tensorboard=False)
     again = {"set": {"breeder.crossover_probability": 0.5}}
-    local.run([local.Job.resumed(path, options, **again) for path in paths])
+    executors.run([Job.resumed(path, options, **again) for path in paths])
     for path in paths:
         run = loop.Run(path)
         assert run.metrics["generation"][-1] == 7
         assert run.algorithm == altered(ALGORITHM, crossover_probability=0.5)
         assert run.config["changes"][0]["set"] == {"breeder.crossover_probability": 0.5}
-    local.run([local.Job.resumed(path, RunOptions()) for path in paths])  # nothing to do
+    executors.run([Job.resumed(path, RunOptions()) for path in paths])  # nothing to do
     with pytest.raises(loop.RunError, match=f"{paths[0]}: this run's budget is 7 generations: a n"):
-        local.Job.resumed(paths[0], RunOptions(generations=3)).finished()
+        Job.resumed(paths[0], RunOptions(generations=3)).finished()
 
 
 def test_callbacks_stay_here(tmp_path):
     options = RunOptions(callbacks=(print,))
     with pytest.raises(ValueError, match="callbacks stay in this process"):
-        local.Job(tmp_path, ALGORITHM, 0, options)
+        Job(tmp_path, ALGORITHM, 0, options)
 
 
 def test_a_signal_reaches_every_worker_and_each_saves(tmp_path):
@@ -197,7 +198,7 @@ def test_a_signal_reaches_every_worker_and_each_saves(tmp_path):
         sys.executable,
         "-c",
         # Two workers, also where there is one core.
-        "import sys; from credo import cli; from credo.executors import local as e; run = e.run\n"
+        "import sys; from credo import cli, executors as e; run = e.run\n"
         "e.run = lambda jobs, **given: run(jobs, workers=2, **given)\ncli.main(sys.argv[1:])",
         *arguments.split(),
     ]
@@ -260,15 +261,16 @@ def main():
 RUNS = """
 import subprocess, sys
 from credo.environments.processes import Child
-from credo.executors import local
+from credo import executors
+from credo.executors import Job, local
 from credo.runs.options import RunOptions
 folder, hearing = sys.argv[1:]
 sys.path.append(folder)
 given = {"grace": 3600.0, "stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
 local._start = lambda: Child("stubborn", folder + "/told", hearing, **given)
-local.Job.finished = lambda self: False
+Job.finished = lambda self: False
 options = RunOptions(generations=5)
-local.run([local.Job(folder + "/run", {"class": "a:B"}, 0, options)], workers=1)
+executors.run([Job(folder + "/run", {"class": "a:B"}, 0, options)], workers=1)
 """
 
 
@@ -320,10 +322,10 @@ def test_workers_end_with_a_parent_that_is_killed(runs):
 
 
 def test_what_a_stranger_recorded_is_not_trusted_by_a_worker(tmp_path):
-    job = local.Job(tmp_path, ALGORITHM, 0, FIVE)
+    job = Job(tmp_path, ALGORITHM, 0, FIVE)
     assert json.loads(job.message())["again"]["trust"] is True
     tree = json.loads(json.dumps(config.to_tree(ALGORITHM))) | {"class": "nowhere:Algorithm"}
-    job = local.Job(tmp_path, tree, 0, FIVE)
+    job = Job(tmp_path, tree, 0, FIVE)
     assert json.loads(job.message())["again"]["trust"] is False  # and nothing was imported for it
     assert config.changed(tree, tree) == []
     assert os.listdir(tmp_path) == []
@@ -341,6 +343,6 @@ def test_modules_that_open_a_task_while_they_are_imported_are_trained(tmp_path, 
     monkeypatch.syspath_prepend(tmp_path)
     mine = importlib.import_module("opens_1").Mine()
     algorithm = Neuroevolution(mine, MLP((2,)), population_size=10, episodes=1, test_episodes=1)
-    jobs = [local.Job(tmp_path / f"{seed}", algorithm, seed, FIVE) for seed in (0, 1)]
-    local.run(jobs, 2)
+    jobs = [Job(tmp_path / f"{seed}", algorithm, seed, FIVE) for seed in (0, 1)]
+    executors.run(jobs, 2)
     assert all(job.finished() for job in jobs)

@@ -18,7 +18,7 @@ from credo.environments.host import (
     EnvironmentFailure,
     HostStep,
 )
-from credo.executors import local
+from credo.executors import Job
 from credo.networks.base import AbstractNetwork
 from credo.networks.mlp import MLP
 from credo.runs import config, loop
@@ -324,7 +324,7 @@ def test_a_warm_start_begins_with_the_champion_of_another_run(straight, tmp_path
 
 def test_a_job_has_a_budget_of_frames(straight, tmp_path):
     path = tmp_path / "run"
-    job = local.Job(path, ALGORITHM, 0, RunOptions(frames=40))
+    job = Job(path, ALGORITHM, 0, RunOptions(frames=40))
     assert not job.finished()
     train(path, frames=30)
     assert not job.finished()
@@ -332,10 +332,10 @@ def test_a_job_has_a_budget_of_frames(straight, tmp_path):
     resume(path, frames=40)
     assert job.finished()
     assert read_metadata(path / "champion.safetensors")["generation"] == "4"
-    assert local.Job(path, ALGORITHM, 0, RunOptions()).finished()  # the algorithm's own budget
+    assert Job(path, ALGORITHM, 0, RunOptions()).finished()  # the algorithm's own budget
     with pytest.raises(loop.RunError, match="frames: 40 != 30"):
-        local.Job(path, ALGORITHM, 0, RunOptions(frames=30)).finished()
+        Job(path, ALGORITHM, 0, RunOptions(frames=30)).finished()
     with pytest.raises(loop.RunError, match="frames: 40 != None"):
-        local.Job(path, ALGORITHM, 0, RunOptions(generations=100)).finished()
+        Job(path, ALGORITHM, 0, RunOptions(generations=100)).finished()
     with pytest.raises(loop.RunError, match="warm start: None != other"):
-        local.Job(path, ALGORITHM, 0, RunOptions(), warm_start="other").finished()
+        Job(path, ALGORITHM, 0, RunOptions(), warm_start="other").finished()

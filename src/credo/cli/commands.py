@@ -10,6 +10,7 @@ import pathlib
 from typing import Any, Literal
 
 from .. import require
+from ..executors import Place
 from ..experiments.catalogue import EXPERIMENTS
 from ..runs.ending import say
 from .line import Line
@@ -219,11 +220,12 @@ class Reproduce:
     """Cells whose name has this regular expression, as '2-deep, fsp'; a word that is in none lists
     them. What was measured of other cells stays. None: all."""
     jobs: int | None = None
-    """Processes at a time, at least 1. None: one per core."""
+    """Runs at a time, at least 1. None: as many as there is room for, here one per core."""
     output: pathlib.Path = pathlib.Path("reproduced")
     """Folder for the page and its data."""
     work: pathlib.Path = pathlib.Path("runs/reproduce")
     """Folder for the runs behind them."""
+    place: Place = Place()  # noqa: RUF009
 
     def __post_init__(self):
         require.at_least("runs", self.runs, 1)
@@ -238,7 +240,8 @@ class Reproduce:
 
         names = ("runs", "only", "jobs", "output", "work")
         given = {name: getattr(self, name) for name in names}
-        print(f"page: {base.reproduce(self.experiment, self.budget, **given)}")
+        page = base.reproduce(self.experiment, self.budget, on=self.place, **given)
+        print(f"page: {page}")
 
 
 @dataclasses.dataclass

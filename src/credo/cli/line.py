@@ -20,7 +20,7 @@ from .values import leaves, plain, read, split, typed
 
 TOKEN = re.compile(r"--([^\W\d][^=]*)(?:=(.*))?", re.DOTALL)
 LETTERS = {"-h": "--help", "-o": "--output"}
-OPEN = re.compile(r"((env|options|breeder)\.)+")  # fields of these need no prefix
+OPEN = re.compile(r"((env|options|place|breeder)\.)+")  # fields of these need no prefix
 CHOSEN = ("env", "network", "options")  # by words and flags of the command
 
 
@@ -181,7 +181,8 @@ class Line:
             for flag in known.values():
                 groups.setdefault(flag.path.rpartition(".")[0], []).append(flag.help(flag.text))
             for title, texts in groups.items():
-                print(*[] if title in ("", "options") else [f"\n{title}"], *texts, sep="\n")
+                head = [] if title in ("", "options", "place") else [f"\n{title}"]
+                print(*head, *texts, sep="\n")
         else:
             for flag in [known[name] for name in CATALOGUE["screen"]["first"] if name in known]:
                 print(flag.help(re.split(r"(?<=[\w`)\]])(?<!^\w)[.:;] ", flag.text)[0]))

@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 from typing import Any
 
+from ..executors import Place
 from ..runs.ending import say
 from ..runs.options import RunOptions
 from .line import Line, shorts
@@ -29,15 +30,17 @@ class Resume:
     without_replay: bool = False
     """Go on with an empty replay buffer if its files are damaged; else a run whose buffer cannot be
     read is not resumed."""
+    place: Place = Place()  # noqa: RUF009
     options: RunOptions = RunOptions()  # noqa: RUF009
 
     def __call__(self, line: Line) -> None:
-        """Go on, with several runs in processes of their own, and print a summary of each."""
+        """Go on, with several runs in processes of their own or elsewhere, and print a summary of
+        each."""
         for name in [name for name, _ in line.given if name in CATALOGUE["short"]]:
             setting = name.replace("-", "_")
             fail(f"--{name} is a setting of the run's algorithm: give it as --set {setting}=VALUE")
         line.done()
-        from ..executors import local
+        from .. import executors
         from ..runs import folder, loop
         from ..runs.store import Run
 
@@ -45,15 +48,15 @@ class Resume:
         for path in runs if self.set else ():  # nothing was begun yet
             self.set = _settings(Run(path, trust=self.trust).algorithm, self.set)
         again: Any = {name: getattr(self, name) for name in ("set", "trust", "without_replay")}
-        jobs = [local.Job.resumed(path, self.options, **again) for path in runs]
+        jobs = [executors.Job.resumed(path, self.options, **again) for path in runs]
         for job in [job for job in jobs if self.set and job.finished()]:
             more = "give a larger --generations or --frames with it"
             say(f"credo: --set is not used: {job.path} is finished and trains no more; {more}")
             again["set"] = {}
-        if len(runs) == 1:
+        if len(runs) == 1 and self.place.on == "local":
             loop.resume(runs[0], self.options, **again)
         else:
-            local.run(jobs, title=pathlib.Path(self.run).name)
+            executors.run(jobs, on=self.place, title=pathlib.Path(self.run).name)
         for path in runs:
             print(Run(path, trust=self.trust).summary)
 

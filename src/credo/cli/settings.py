@@ -65,7 +65,8 @@ def written(command: Any, algorithm: Any) -> str:
     """The settings of a command and of its algorithm, for `read`. Names that are the command's or
     the algorithm's are not the task's: its field of the same name is `env.…`."""
     told = {"algorithm": command.algorithm, "task": command.task}
-    fields = [f.name for x in (command, command.options, algorithm) for f in dataclasses.fields(x)]
+    others = (command, command.options, command.place, algorithm)
+    fields = [f.name for x in others for f in dataclasses.fields(x)]
     for value, empty in ((command, (None, {}, ())), (algorithm, ())):
         line = Line("train", [])
         line.reserved = {name.replace("_", "-") for name in fields} - {"rewards", "kwargs"}

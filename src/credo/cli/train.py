@@ -9,6 +9,7 @@ import pathlib
 from typing import Any
 
 from .. import require
+from ..executors import Place
 from ..runs.ending import say
 from ..runs.options import RunOptions
 from .line import Line
@@ -41,7 +42,7 @@ class Train:
     same run."""
     seeds: int = 1
     """Number of runs, at least 1, with --seed and the seeds after it. Several have a process each,
-    one per core at a time."""
+    one per core at a time, unless --on names another place."""
     path: pathlib.Path | None = None
     """Folder of the run, new or empty; of several runs the folder of theirs. None:
     runs/ALGORITHM-TASK-SEED."""
@@ -61,6 +62,7 @@ class Train:
     trust: bool = False
     """Import the code that the file of --config names. Without this such a file is refused: to
     import a module is to execute it."""
+    place: Place = Place()  # noqa: RUF009
     options: RunOptions = RunOptions()  # noqa: RUF009
 
     def __post_init__(self):
@@ -169,9 +171,9 @@ def _network(line: Line, name: str | None, algorithm: str, env: Any) -> Any:
 
 
 def _start(command: Train, algorithm: Any) -> None:
-    """One run here, or several in processes of their own; then how far each came, and whether it
-    learned anything by gradient."""
-    from ..executors import local
+    """One run here, or several in processes of their own, or any number elsewhere; then how far
+    each came, and whether it learned anything by gradient."""
+    from .. import executors
     from ..runs import folder, loop
     from ..runs.store import Run
 
@@ -182,12 +184,17 @@ def _start(command: Train, algorithm: Any) -> None:
     if not start and options.frames is not None and options.frames <= first:
         say(f"credo: note: {late}")
     _note_few(algorithm, options)
-    if command.seeds == 1:
+    if command.seeds == 1 and command.place.on == "local":
         runs = [loop.train(algorithm, options, seed=command.seed, path=path, warm_start=start)]
     else:
         seeds = range(command.seed, command.seed + command.seeds)
-        jobs = [local.Job(path / f"seed-{n}", algorithm, n, options, start) for n in seeds]
-        local.run(jobs, again="the same command" + f" with --path {path}" * (not command.path))
+        paths = [path / f"seed-{n}" if len(seeds) > 1 else path for n in seeds]
+        jobs = [
+            executors.Job(at, algorithm, n, options, start)
+            for at, n in zip(paths, seeds, strict=True)
+        ]
+        again = "the same command" + f" with --path {path}" * (not command.path)
+        executors.run(jobs, on=command.place, again=again)
         runs = [Run(job.path) for job in jobs]
     for run in runs:
         print(run.summary)

@@ -51,8 +51,8 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from .. import tree
-from ..executors import local
+from .. import executors, tree
+from ..executors import Job, Place
 from ..report import pages
 from ..report.rows import Label, Labels, Results, Row, Series, concat, read, rows, series, write
 from ..report.sections import SMOKE, Page, Section, Text
@@ -279,15 +279,17 @@ def reproduce(
     jobs: int | None = None,
     output: pathlib.Path = pathlib.Path("reproduced"),
     work: pathlib.Path = pathlib.Path("runs/reproduce"),
+    on: str | Place = "local",
 ) -> pathlib.Path:
     """Run what is missing, measure, and write `results.json` and `report.html`.
 
     **Arguments:** `runs`: of each cell, instead of what the budget says. `only`: leave out cells in
     whose name this regular expression is not found, in whatever case: "(erl|ddpg), Hopper". What
     earlier commands measured of the others stays, where its settings are today's. `jobs`: runs at
-    a time; None: one per core.
+    a time; None: as many as the place has room for. `on`: where runs are trained (see `Place`).
 
-    **Returns:** the path of the page. **Raises:** `RunError` if there is no such budget or cell.
+    **Returns:** the path of the page. **Raises:** `RunError` if there is no such budget or cell,
+    and what `executors.run` raises.
     """
     experiment = find(name)
     if budget not in experiment.budgets:
@@ -298,7 +300,7 @@ def reproduce(
         chosen = [replace(c, seeds=range(c.seeds[0], c.seeds[0] + runs)) for c in chosen]
     target = output / name / budget / "results.json"
     earlier = None if only is None else kept(target, every, chosen)
-    finished = trained(chosen, budget, work / budget, jobs, f"{name} {budget}")
+    finished = trained(chosen, budget, work / budget, jobs, f"{name} {budget}", on)
     print(f"{name} {budget}: runs are done; measuring", file=sys.stderr)
     flags = {"--budget": budget, "--runs": runs, "--only": only}
     told = [f"{x} {shlex.quote(str(given))}" for x, given in flags.items() if given is not None]
@@ -311,23 +313,28 @@ def reproduce(
 
 
 def trained(
-    cells: list[Cell], budget: str, work: pathlib.Path, jobs: int | None, title: str
+    cells: list[Cell],
+    budget: str,
+    work: pathlib.Path,
+    jobs: int | None,
+    title: str,
+    on: str | Place = "local",
 ) -> list[Trained]:
     """The cells with their runs, in folders of `work`; what is missing of them is trained.
 
     A run is in `work/<name of its cell>/<seed>`, whichever experiment asked for it first. `jobs`:
-    runs at a time; None: one per core.
+    runs at a time; None: as many as the place `on` has room for.
     """
 
     def path(cell: Cell, seed: int) -> pathlib.Path:
         return work / cell.folder / str(seed)
 
     wanted = [
-        local.Job(path(c, seed), c.algorithm, seed, RunOptions(**c.budget, tensorboard=False))
+        Job(path(c, seed), c.algorithm, seed, RunOptions(**c.budget, tensorboard=False))
         for c in cells
         for seed in c.seeds
     ]
-    local.run(wanted, jobs, title=title)
+    executors.run(wanted, jobs, on=on, title=title)
     return [Trained(c, [Run(path(c, seed)) for seed in c.seeds], budget) for c in cells]
 
 
