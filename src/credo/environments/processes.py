@@ -19,6 +19,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from typing import Any
 
 LINUX = sys.platform == "linux"
@@ -210,7 +211,12 @@ def _run(guardian: int, module: str, path: str, opening: bool, arguments: tuple[
     _control(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != guardian:  # it was gone before it could be promised
         os._exit(1)
-    sys.path[:] = json.loads(path)
+    serve(module, json.loads(path), opening, arguments)
+
+
+def serve(module: str, path: list[str], opening: bool, arguments: Sequence[str] = ()) -> None:
+    """Do what a child is for, `module.main()`, in this process; modules are found at `path`."""
+    sys.path[:] = path
     sys.argv = [module, *arguments]
     here: Any = importlib.import_module("credo.environments.processes")
     here._worker, here._opening = True, opening

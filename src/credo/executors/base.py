@@ -8,7 +8,7 @@ from .. import require
 from ..runs import screen
 from ..runs.loop import Interrupted
 from ..runs.record import RunError
-from .jobs import Job
+from .jobs import Job, Pending
 from .places import Place
 
 
@@ -32,7 +32,8 @@ def run(
 
     **Raises:** `ValueError` for a place that there is not; `RunError` if a folder holds another
     run, before anything is started, or with all failures once every job was tried; `Interrupted`
-    after a signal: what is trained is saved first.
+    after a signal: what is trained is saved first; `Pending` where runs are trained later, by a
+    cluster.
     """
     place = on if isinstance(on, Place) else Place(on)
     require.at_least("workers", workers, 1)
@@ -48,6 +49,11 @@ def run(
     if ending.failures:
         told = "\n".join(ending.failures)
         raise RunError(f"{len(ending.failures)} of {len(waiting)} runs failed:\n{told}")
+    if ending.pending:
+        raise Pending(
+            f"{ending.pending}. Once these have ended, {again} submits what stopped, or goes on "
+            "when every run is finished"
+        )
     if left := [job for job in waiting if not job.finished()]:
         names = ", ".join(job.state() for job in left)
         screen.say(

@@ -12,6 +12,9 @@ from ..runs.options import RunOptions
 from ..runs.record import RunError
 from ..runs.store import CHAMPION, Run
 
+PATIENCE = 3700.0
+"""Seconds that a run of a cluster waits for an earlier try of it, which may still be saving."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Job:
@@ -100,8 +103,12 @@ class Job:
                 "remove it or choose another folder"
             )
 
-    def message(self) -> str:
-        """What a worker is told, as a line of JSON."""
+    def message(self, patience: float = 0.0) -> str:
+        """What a worker is told, as a line of JSON.
+
+        `patience`: seconds that it waits for another process which has the run, as one that is
+        still saving where an earlier try of the job began.
+        """
         # Objects are the caller's own; a tree may be what a stranger recorded.
         again = (
             {"trust": not isinstance(self.algorithm, dict)} if self.again is None else self.again
@@ -111,6 +118,7 @@ class Job:
             options = options.changed(dataclasses.asdict(self.budget))
         told = {"path": str(self.path), "algorithm": self.tree, "seed": self.seed}
         told |= {"warm_start": self.warm_start, "options": options.record(), "again": again}
+        told |= {"patience": patience}
         return json.dumps(told)
 
     def state(self) -> str:
@@ -126,8 +134,17 @@ class Ending(NamedTuple):
     """How the training of some jobs ended.
 
     `failures`: a line for each job that failed, with its path. `signal`: the number of the signal
-    that stopped it, everything saved; 0: none did.
+    that stopped it, everything saved; 0: none did. `pending`: what is still to happen elsewhere, in
+    words; "": nothing.
     """
 
     failures: list[str]
     signal: int = 0
+    pending: str = ""
+
+
+class Pending(RunError):
+    """Runs were handed over to a cluster, or are with it since an earlier command: this one ends
+    here, and has not failed."""
+
+    code = 0

@@ -11,15 +11,20 @@ import json
 import os
 import pathlib
 import sys
+import time
 import warnings
 from typing import Any
 
 from ..environments import processes
+from .array import ALL_CORES
+
+POLL = 0.5  # seconds between two looks whether a run is free
 
 
 def main() -> None:
     """Take jobs until there are none. Ends with 128 + n after signal n, saved."""
-    processes.settle()
+    if sys.argv[1:] != [ALL_CORES]:
+        processes.settle()
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever prints must not look like an answer
 
@@ -36,7 +41,7 @@ def main() -> None:
             jax.clear_caches()  # programs of an earlier cell would pile up
             before = job["algorithm"]
         try:
-            _train(job)
+            _train_when_free(job)
             answer = {"ok": job["path"]}
         except Interrupted as error:
             answer, stop = {"error": str(error)}, error.code
@@ -46,6 +51,25 @@ def main() -> None:
             print(json.dumps(answer), file=answers, flush=True)
         if stop is not None:
             raise SystemExit(stop)
+
+
+def _train_when_free(job: dict[str, Any]) -> None:
+    """Train once no other process has the run. Raises `RunLocked` if one still has it after the
+    job's `patience` in seconds."""
+    from ..runs.ending import say
+    from ..runs.lock import RunLocked
+
+    until, told = time.monotonic() + job["patience"], False
+    while True:
+        try:
+            return _train(job)
+        except RunLocked as error:
+            if time.monotonic() >= until:
+                raise
+            if not told:
+                told = True
+                say(f"credo: waiting for it: {error}")
+        time.sleep(POLL)
 
 
 def _train(job: dict[str, Any]) -> None:
