@@ -46,6 +46,8 @@ def run(
     ending = _trainer(place)(waiting, workers, place, title)
     if ending.signal:
         raise Interrupted(f"stopped and saved; {again} goes on where it was", 128 + ending.signal)
+    if ending.lost:
+        raise RunError(f"{ending.lost}; {again} goes on where they are")
     if ending.failures:
         told = "\n".join(ending.failures)
         raise RunError(f"{len(ending.failures)} of {len(waiting)} runs failed:\n{told}")

@@ -11,9 +11,9 @@ from ..runs.budget import Budget
 from ..runs.options import RunOptions
 from ..runs.record import RunError
 from ..runs.store import CHAMPION, Run
+from .worker import SAVE
 
-PATIENCE = 3700.0
-"""Seconds that a run of a cluster waits for an earlier try of it, which may still be saving."""
+PATIENCE = SAVE + 100.0  # seconds that a run of a cluster waits for an earlier try that is saving
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,12 +135,13 @@ class Ending(NamedTuple):
 
     `failures`: a line for each job that failed, with its path. `signal`: the number of the signal
     that stopped it, everything saved; 0: none did. `pending`: what is still to happen elsewhere, in
-    words; "": nothing.
+    words; "": nothing. `lost`: why the place is gone, in words; "": it is not.
     """
 
     failures: list[str]
     signal: int = 0
     pending: str = ""
+    lost: str = ""
 
 
 class Pending(RunError):

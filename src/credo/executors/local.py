@@ -21,9 +21,9 @@ from . import worker
 from .board import Board
 from .jobs import Ending, Job
 from .places import Place
+from .worker import SAVE
 
 GRACE = 10.0  # seconds that a worker without a job has to end in
-SAVE = 3600.0  # seconds to finish a generation and save in, after a signal or our end
 
 
 def train(jobs: Sequence[Job], workers: int | None, place: Place, title: str) -> Ending:

@@ -18,6 +18,7 @@ from typing import Any
 from ..environments import processes
 from .array import ALL_CORES
 
+SAVE = 3600.0  # seconds to finish a generation and save in, after a signal or the parent's end
 POLL = 0.5  # seconds between two looks whether a run is free
 
 
