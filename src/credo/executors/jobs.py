@@ -36,6 +36,7 @@ class Job:
     again: dict[str, Any] | None = None
 
     def __post_init__(self):
+        object.__setattr__(self, "path", pathlib.Path(self.path))
         if self.options.callbacks:
             raise ValueError(
                 "callbacks stay in this process, and several runs have processes of their own: "

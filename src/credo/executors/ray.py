@@ -10,6 +10,7 @@ asked, at the start and before each task.
 
 import contextlib
 import importlib
+import math
 import os
 import pathlib
 import signal
@@ -206,8 +207,9 @@ def _connected(
     address = address or os.environ.get("RAY_ADDRESS", "local")
     how: dict[str, Any] = {"address": address, "logging_level": "WARNING"}
     if address == "local":
-        room = max(len(processes.cores()), (workers or 0) * needs["num_cpus"])
+        room = max(len(processes.cores()), math.ceil((workers or 0) * needs["num_cpus"]))
         how |= {"num_cpus": room, "include_dashboard": False, "object_store_memory": STORE}
+        how |= {"logging_level": "ERROR"}  # nobody can reach it whom it might warn of
     before = signal.getsignal(signal.SIGTERM)
     try:
         try:
