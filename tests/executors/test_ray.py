@@ -233,6 +233,27 @@ def test_a_signal_saves_on_every_node(cluster, straight):
 @linux
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
+def test_a_second_signal_ends_what_cannot_save(cluster):
+    with Command(f"ray:{cluster.address}") as command:
+        command.wait_until(both_under_way)
+        deaf = [trainer(0), trainer(1)]
+        for pid in deaf:
+            os.kill(pid, signal.SIGSTOP)
+        command.process.send_signal(signal.SIGINT)
+        time.sleep(2)
+        assert command.process.poll() is None
+        command.process.send_signal(signal.SIGINT)
+        code, told = command.end()
+        assert code == 130, told
+        deadline = time.monotonic() + 20
+        while any(os.path.exists(f"/proc/{pid}") for pid in deaf):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
 def test_each_run_has_a_gpu_of_its_own(cluster):
     """Ray counts them, and this one believes what it is told."""
     cluster.add_node(num_cpus=2, num_gpus=2)

@@ -96,12 +96,15 @@ class _Crew:
                 while self.under_way and not self.lost:
                     if self.signals.received and not asked:
                         asked = True
-                        for task in self.under_way:
-                            self.ray.cancel(task)  # by which they save
+                        self.cancel()  # by which they save
                     self.listen()
                     self.lost = self.head.missing()
                     self.board.show([job for job in self.under_way.values() if _begun(job)])
                 self.wait_for_files()
+            except SystemExit:  # after a second signal; Ray may have made its code another
+                self.cancel()  # by which they end at once
+                self.ray.wait(list(self.under_way), num_returns=len(self.under_way), timeout=1.0)
+                raise SystemExit(128 + self.signals.received) from None
             finally:
                 self.board.stop()
         return self.signals.received
@@ -113,7 +116,7 @@ class _Crew:
             if job is None:
                 return
             mark = self.marks[_parent(job)]
-            train = self.remote.options(name=job.path.name)
+            train = self.remote.options(name="/".join(job.path.parts[-2:]))
             self.under_way[train.remote(job.message(PATIENCE), mark, self.setup)] = job
 
     def listen(self) -> None:
@@ -128,6 +131,11 @@ class _Crew:
                 else:
                     self.trained.append(job)
         self.give(number)
+
+    def cancel(self) -> None:
+        """Interrupt all tasks."""
+        for task in self.under_way:
+            self.ray.cancel(task)
 
     def answer(self, task: Any) -> dict[str, Any]:
         """What a task returned, or why Ray has nothing of it."""
