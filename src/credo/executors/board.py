@@ -1,7 +1,7 @@
 """What a person sees while many runs are trained."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 from ..runs.progress import Line, clock
 from .jobs import Job
@@ -31,7 +31,7 @@ class Board:
         self.done += 1
         self.line.show(f"{self.told()} {job.path}", self.done)
 
-    def show(self, under_way: Sequence[Job]) -> None:
+    def show(self, under_way: Iterable[Job]) -> None:
         """Say now and then how far these are."""
         if time.monotonic() - self.line.last > (1.0 if self.line.console.is_terminal else TOLD):
             states = ", ".join(job.state() for job in under_way)

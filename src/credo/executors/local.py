@@ -67,7 +67,7 @@ class _Crew:
                         for one in self.under_way:
                             one.process.terminate()  # by which they save
                     self.listen()
-                    self.board.show([one.job for one in self.under_way])
+                    self.board.show(one.job for one in self.under_way)
         finally:
             self.end()
             self.board.stop()

@@ -98,12 +98,13 @@ class _Crew:
                         asked = True
                         self.cancel()  # by which they save
                     self.listen()
-                    self.lost = self.head.missing()
-                    self.board.show([job for job in self.under_way.values() if _begun(job)])
+                    self.lost = self.head.missing() if self.under_way else ""
+                    self.board.show(job for job in self.under_way.values() if _begun(job))
                 self.wait_for_files()
             except SystemExit:  # after a second signal; Ray may have made its code another
                 self.cancel()  # by which they end at once
-                self.ray.wait(list(self.under_way), num_returns=len(self.under_way), timeout=1.0)
+                if tasks := list(self.under_way):
+                    self.ray.wait(tasks, num_returns=len(tasks), timeout=1.0)
                 raise SystemExit(128 + self.signals.received) from None
             finally:
                 self.board.stop()
@@ -142,7 +143,7 @@ class _Crew:
         try:
             return self.ray.get(task)
         except self.ray.exceptions.RayError as error:
-            return {"error": f"{type(error).__name__}: {str(error).strip()}"}
+            return {"error": f"{_brief(error)} What was saved stands: the same command goes on"}
 
     def wait_for_files(self) -> None:
         """Wait for what other nodes wrote to be seen here: NFS may show a folder as it was."""
@@ -177,6 +178,13 @@ class _Head:
                     "the cluster again"
                 )
         return ""
+
+
+def _brief(error: Exception) -> str:
+    """An error of Ray's in a line: what was raised on a node comes last, behind its traceback."""
+    lines = str(error).strip().splitlines() or [""]
+    raised = type(error).__name__.startswith("RayTaskError")
+    return lines[-1] if raised else f"{type(error).__name__}: {lines[0]}"
 
 
 def _reach(address: str, patience: float) -> None:
@@ -273,7 +281,7 @@ def _check_nodes(ray: Any, marks: Sequence[str], needs: Mapping[str, Any], alone
         try:
             why = ray.get(task)
         except ray.exceptions.RayError as error:
-            why = str(error).strip().splitlines()[-1]
+            why = f"cannot train: {_brief(error)}"
         if why:
             raise RunError(f"node {found['NodeManagerHostname']} {why}")
 
