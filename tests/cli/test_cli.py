@@ -494,7 +494,7 @@ def test_a_place_that_there_is_not_is_refused(credo, words, tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     code, out, err = credo(f"{words} --on locale")
     assert (code, out) == (2, "")
-    told = "credo: --on is 'locale': runs are trained on local"
+    told = "credo: --on is 'locale': runs are trained on local, slurm, ray or ray:HOST:PORT"
     assert err.splitlines()[-1] == f"{told} (did you mean 'local'?)"
     assert list(tmp_path.iterdir()) == []
 
