@@ -18,6 +18,7 @@ LEVELS = [
     {"runs"},
     {"executors"},
     {"report"},
+    {"sweep"},
     {"experiments"},
     {"cli"},
     {"__main__"},

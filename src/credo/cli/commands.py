@@ -16,6 +16,7 @@ from ..runs.ending import say
 from .line import Line
 from .names import CATALOGUE, fail
 from .resume import Resume as Resume
+from .sweep import Sweep as Sweep
 from .train import Train as Train
 from .train import require_seeds
 

@@ -6,6 +6,7 @@ of its fields before the next is made of it; then one run is trained, or one for
 
 import dataclasses
 import pathlib
+from collections.abc import Callable
 from typing import Any
 
 from .. import require
@@ -101,21 +102,31 @@ def require_seeds(first: int, number: int = 1) -> None:
 
 
 def _algorithm(line: Line, command: Train) -> Any:
-    """The algorithm of a task and network, with all that was typed about them. What they raise
-    about their settings, or about one another, ends the command."""
+    """`algorithm_of` the command, which ends if that raises."""
+    return or_fail(lambda: algorithm_of(line, command))
+
+
+def or_fail(make: Callable[[], Any]) -> Any:
+    """What `make` makes; the command ends with what it says of values that cannot be."""
+    try:
+        return make()
+    except ValueError as error:
+        fail(str(error))
+
+
+def algorithm_of(line: Line, command: Train) -> Any:
+    """The algorithm of a task and network, with all that was typed about them. Raises what they
+    raise about their settings, or about one another."""
     word = command.algorithm
     build, fields = _builder(word, command.preset)
     line.reserved |= fields
-    try:
-        env = _task(line, command)
-        network = _network(line, command.network or ALGORITHMS[word].get("network"), word, env)
-        if command.delayed:
-            from ..environments import wrappers
+    env = _task(line, command)
+    network = _network(line, command.network or ALGORITHMS[word].get("network"), word, env)
+    if command.delayed:
+        from ..environments import wrappers
 
-            env = wrappers.delayed(env)
-        return line.take(build(env, network))
-    except ValueError as error:
-        fail(str(error))
+        env = wrappers.delayed(env)
+    return line.take(build(env, network))
 
 
 def _task(line: Line, command: Train) -> Any:

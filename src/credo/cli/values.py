@@ -42,6 +42,8 @@ def read(name: str, kind: Any, words: list[str], old: Any, rest: list[str]) -> A
     if kind is bool and words[:1] not in (["True"], ["False"]):
         rest += words
         return True
+    if int in inside and float not in inside:
+        words = [word.removesuffix(".0") for word in words]  # 1e6 in a file
     if tuple in inside:
         words = ",".join(words).split(",") if str in inside and words else split(words)
     elif str in inside and len(words) == 1:
