@@ -18,7 +18,7 @@ import pytest
 from jax.errors import JaxRuntimeError
 
 from credo import cli, require
-from credo.cli import tasks, train
+from credo.cli import settings, tasks, train
 from credo.cli.line import Line
 from credo.cli.names import ALGORITHMS, COMMANDS, NETWORKS, TASKS, load
 from credo.environments.gymnasium import Gymnasium
@@ -566,6 +566,32 @@ def test_all_settings_are_written_and_read(credo, tmp_path, monkeypatch):
     assert list(tmp_path.glob("runs*")) == []
 
 
+PRESETS = [
+    (word, preset) for word in ALGORITHMS for preset in (None, *ALGORITHMS[word].get("presets", ()))
+]
+
+
+@pytest.mark.parametrize(("word", "preset"), PRESETS)
+def test_the_settings_of_every_preset_are_read_as_they_were(word, preset):
+    tasks = {"one agent": "Pendulum-v1", "a team": "rover"}
+    task = tasks.get(ALGORITHMS[word].get("learns", "one agent"), "sequence-recall")
+    argv = [word, task]
+    if preset:
+        argv = [word, "rover" if preset == "dmmu" else task, "--preset", preset]
+        argv += ["--network", "dmmu"] if preset == "dmmu" else []
+
+    def made(line):
+        command = line.command(train.Train)
+        algorithm = train._algorithm(line, command)
+        line.done()
+        return command, algorithm
+
+    command, algorithm = made(Line("train", argv))
+    saved, again = tomllib.loads(settings.written(command, algorithm)), Line("train", [])
+    settings.place(again, settings.read("run.toml", saved, trust=False))
+    assert made(again)[1] == algorithm
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -811,8 +837,8 @@ def test_a_module_that_cannot_be_used_is_a_failure(
 
 def test_a_function_makes_a_task_with_the_settings_it_is_given(credo, own_tasks, tmp_path):
     task = f"{own_tasks}:swing"
-    for settings in ("--kwargs g=5.0", "--kwargs.g 5.0", "--kwargs g 5.0"):
-        code, out, _ = credo(f"check {task} --in-process True {settings}")
+    for given in ("--kwargs g=5.0", "--kwargs.g 5.0", "--kwargs g 5.0"):
+        code, out, _ = credo(f"check {task} --in-process True {given}")
         assert (code, out) == (0, f"{task}: 0 problems found\n")
     code, _, err = credo(f"check {task} --in-process True --kwargs h=5")
     assert code == 2

@@ -4,6 +4,7 @@ The script asks `credo --complete WORDS…` what can come next; that imports no 
 """
 
 from ..experiments.catalogue import EXPERIMENTS
+from ..sweep.plan import Plan
 from . import commands
 from .line import Line
 from .names import ALGORITHMS, CATALOGUE, COMMANDS, fail
@@ -40,6 +41,8 @@ def next(words: list[str]) -> str:
         case [command, *_] if command in COMMANDS:
             line = Line(command, ["", ""])
             line.command(getattr(commands, command.title()))
+            if command == "sweep":
+                line.take(Plan())
             names = [*(CATALOGUE["short"] if command == "train" else ()), *line.known()]
             return " ".join(f"--{name}" for name in names)
     return ""

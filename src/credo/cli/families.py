@@ -24,9 +24,10 @@ class Family(NamedTuple):
     """The field is a tuple of them."""
 
     def word(self, value: Any) -> str:
-        """The word for what stands there; of what has no word, the name of its class."""
+        """The word for what stands there; of what has no word, the name of its class. Of no member
+        it is none, or nothing where `none` is the word of a member."""
         if isinstance(value, tuple):
-            return ",".join(map(self.word, value)) or "none"
+            return ",".join(map(self.word, value)) or ("" if self.makers.get("none") else "none")
         words = {path: word for word, path in self.makers.items()}
         return "none" if value is None else words.get(_path(type(value)), type(value).__name__)
 

@@ -54,7 +54,8 @@ class File(NamedTuple):
         ranges, search = found.pop("ranges", {}), found.pop("sweep", {})
         if not (isinstance(ranges, dict) and isinstance(search, dict)):
             fail(f"{path}: ranges and sweep are tables: write [ranges] and [sweep]")
-        return cls(path, *(dict(settings.flat(x, _is_range)) for x in (found, ranges, search)))
+        flat = settings.flat
+        return cls(path, dict(flat(found)), dict(flat(ranges, _is_range)), dict(flat(search)))
 
     def said(self, trust: bool) -> Filed:
         """What it says of the search, as flags. Ends the command if no search has such a field."""
@@ -116,6 +117,8 @@ def checked(file: File, *, trust: bool) -> Trials:
     if not file.ranges:
         fail(f"{file.path} has no [ranges]: a sweep needs one at least, such as {space.EXAMPLE}")
     ranges = [_range(file.path, name, value, trust) for name, value in file.ranges.items()]
+    for name in [name for name in file.ranges if name in file.fixed]:
+        fail(f"{file.path} sets {name}, and has a range of it: leave one of them")
     try:
         space.require_known(ranges)
     except ValueError as error:
