@@ -35,7 +35,8 @@ def test_what_a_file_says_is_a_range(value, expected):
     [
         ([], "give { low"),
         ({}, "give { low"),
-        ({"low": 1}, "x needs low and high"),
+        ({"low": 1}, "give { low"),
+        ({"low": 1, "high": 2, "log": 1}, "give { low"),
         ({"low": 1, "high": 2, "choices": [1]}, "give { low"),
         ({"low": 1, "hihg": 2}, r"no 'hihg' \(did you mean 'high'\?\)"),
         ({"low": 2, "high": 1}, "low is 2 and high 1: give low < high"),
@@ -48,7 +49,7 @@ def test_what_a_file_says_is_a_range(value, expected):
         ({"low": 0.0, "high": 1.0, "step": -0.5}, "it must be above 0 and divide the range"),
         (["a", "b", "a"], "x has a value twice"),
         ({"choices": ["a"], "when": "b"}, "when is 'b': write when ="),
-        ("cem", "x is 'cem'|choices"),
+        ("cem", "x is 'cem': give { low"),
     ],
 )
 def test_what_cannot_be_a_range_is_told(value, told):

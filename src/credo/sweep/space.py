@@ -14,7 +14,7 @@ from typing import Any
 from .. import require
 
 Drawn = dict[str, Any]  # by name: a number of a range of numbers, a word of a list
-FIELDS = ("low", "high", "step", "log", "choices", "when")
+FIELDS = ("low", "high", "step", "log")
 EXAMPLE = '"learner.gamma" = { low = 0.9, high = 0.999 }'
 FORMS = "{ low = …, high = … }, also with log = true or step = …, or a list of values"
 
@@ -61,11 +61,8 @@ class Range:
 
     def _require_number(self, name: str) -> None:
         value = getattr(self, name)
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not math.isfinite(value)
-        ):
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (number and math.isfinite(value)):
             raise ValueError(f"{self.name}: {name} is {value!r}: it must be a finite number")
         if self.whole and value != int(value):
             raise ValueError(f"{self.name}: {name} is {value}: it must be a whole number")
@@ -82,22 +79,17 @@ class Range:
     @classmethod
     def of(cls, name: str, value: Any) -> "Range":
         """The range that a file says: a list of values, or a table."""
-        table = value if isinstance(value, dict) else {"choices": value}
-        for field in table.keys() - set(FIELDS):
+        numbers = dict(value) if isinstance(value, dict) else {"choices": value}
+        listed, when = numbers.pop("choices", []), numbers.pop("when", {})
+        for field in numbers.keys() - set(FIELDS):
             raise ValueError(f"{name} has no {field!r}{require.suggestion(field, FIELDS)}: {FORMS}")
-        listed = table.get("choices", [])
-        numbers = {
-            field: table[field] for field in ("low", "high", "step", "log") if field in table
-        }
-        if not isinstance(listed, list) or bool(listed) == bool(numbers):
+        two = {"low", "high"} <= numbers.keys() and isinstance(numbers.get("log", False), bool)
+        if not isinstance(listed, list) or (numbers if listed else not two):
             raise ValueError(f"{name} is {value!r}: give {FORMS}")
-        if not listed and not {"low", "high"} <= numbers.keys():
-            raise ValueError(f"{name} needs low and high: give {FORMS}")
-        when = table.get("when", {})
         if not isinstance(when, dict):
             raise ValueError(f'{name}: when is {when!r}: write when = {{ "other-flag" = "word" }}')
         conditions = tuple((flag.replace("_", "-"), words(x)) for flag, x in when.items())
-        return cls(name, words(listed) if listed else (), **numbers, when=conditions)
+        return cls(name, words(listed), **numbers, when=conditions)
 
     @property
     def ends(self) -> tuple[Any, ...]:
