@@ -55,18 +55,20 @@ class Sweep:
             self._search(folder, file, trials, plan)
 
     def _found(self) -> tuple[File, pathlib.Path]:
-        """The file, and the folder of its sweep: each may be named by the other."""
+        """The file, and the folder of its sweep: each may be named by the other. What is best is
+        read in the folder."""
         given = pathlib.Path(self.file)
-        if not given.is_dir() and not self.best:
-            return File.read(self.file), self.path or pathlib.Path("runs") / given.stem
-        folder = given if given.is_dir() else self.path or pathlib.Path("runs") / given.stem
-        if not (folder / NAME).exists():
-            fail(f"{folder} is no sweep: it has no {NAME}; begin one: credo sweep FILE.toml")
-        return File.read(str(folder / NAME)), folder
+        begun = given.is_dir()
+        folder = self.path or (given if begun else pathlib.Path("runs") / given.stem)
+        home = given if begun and not self.best else folder
+        if not (begun or self.best):
+            return File.read(self.file), folder
+        if not (home / NAME).exists():
+            fail(f"{home} is no sweep: it has no {NAME}; begin one: credo sweep FILE.toml")
+        return File.read(str(home / NAME)), folder
 
     def _search(self, folder: pathlib.Path, file: File, trials: Trials, plan: Plan) -> None:
         """Search in a folder that this process owns meanwhile; then say what was found."""
-        from ..runs import config, names
         from ..sweep import journal, page, search
         from . import tasks
 
@@ -79,7 +81,7 @@ class Sweep:
         require_seeds(command.seed, plan.seeds + 1)  # the last one is for --best
         tasks.require_sound(command.task, algorithm.env)
         seeds = range(command.seed, command.seed + plan.seeds)
-        what = names.run_name(config.to_tree(algorithm))
+        what = f"{command.algorithm} on {command.task}"
         with _owned(folder):
             settle(folder, file, plan, trust=self.trust)
             book = journal.Journal(folder, plan, trials.ranges, owned=True)
@@ -107,20 +109,16 @@ def _write_best(folder: pathlib.Path, target: pathlib.Path, trials: Trials, plan
     command, algorithm = trials.made(top.drawn)
     seeds = range(command.seed, command.seed + plan.seeds)
     complete = sum(trial.state == journal.COMPLETE for trial in known)
-    told = (
-        f"trial {top.number} of {folder}, the best of {complete} complete ones: {top.value:.4g}, "
-        f"the interquartile mean over seeds {_told(seeds)}"
-    )
-    why = (
-        "these seeds chose it, so its score flatters; report fresh ones, from the `seed` below on:"
-    )
-    how = f"credo train --config {target} --seeds 10"
+    told = [
+        f"Trial {top.number} of {folder}, the best of {complete} complete ones: {top.value:.4g}, "
+        f"the interquartile mean over seeds {_told(seeds)}.",
+        f"These seeds chose it, so that number flatters. Report others, from {seeds.stop} on:",
+        f"  credo train --config {target} --seeds 10",
+    ]
     fresh = dataclasses.replace(command, seed=seeds.stop)
-    target.write_text(
-        f"# {told}\n# {why}\n#   {how}\n{settings.written(fresh, algorithm)}", "utf-8"
-    )
-    print(f"{target}: {told}")
-    print(why.replace("the `seed` below", f"seed {seeds.stop}"), how)
+    head = "".join(f"# {line}\n" for line in told)
+    target.write_text(head + settings.written(fresh, algorithm), "utf-8")
+    print(f"wrote {target}", *told, sep="\n")
 
 
 def _told(seeds: range) -> str:

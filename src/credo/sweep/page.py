@@ -53,7 +53,7 @@ def describe(folder: pathlib.Path, journal: Journal, what: str, seeds: Sequence[
             _table(trials, journal.ranges, plan, seeds),
         ],
         facts={
-            "score": f"{plan.metric}, mean of the last {plan.last:g} of a run's generations",
+            "score": f"{plan.metric}, mean of a run's last {100 * plan.last:g} % of generations",
             "sampler": f"{plan.sampler}, seed {plan.seed}, rounds of {plan.together}",
             "seeds of runs": ", ".join(map(str, seeds)),
             "pruning": _rule(plan),
