@@ -16,6 +16,7 @@ from credo import cli
 from credo.cli import sweep_file
 from credo.cli.sweep_file import File
 from credo.environments.sequence_recall import SequenceRecall
+from credo.executors import local
 from credo.runs.lock import lock
 from credo.runs.store import Run
 from credo.sweep.journal import Journal, best
@@ -121,6 +122,7 @@ CEM = 'breeder = ["genetic", "cem"]\n'
         (ranged('config = ["a.toml"]'), "sets --config, which is for the command line alone"),
         (f'path = "there"{TINY}', "sets path: where runs lie is for the sweep to say"),
         (f'wall-clock = "2h"{TINY}', "sets wall-clock: what a run reaches in a time"),
+        (f'on = "slurm"{TINY}', "sets on: where runs are trained is for the command line alone"),
         (f"seeds = 3{TINY}", "sets seeds: how many a trial has is said in [sweep]"),
         (f"gamma = 0.9{TINY}", "no flag '--gamma'"),
         (ranged(f"{CEM}parents = {{ low = 0.4, high = 0.6 }}"), "no flag '--parents'"),
@@ -149,6 +151,7 @@ def test_what_cannot_be_is_told_before_anything_is_begun(credo, text, told):
         ("sweep .", 2, ". is no sweep: it has no sweep.toml"),
         ("sweep tiny.toml --best best.toml", 2, "runs/tiny is no sweep"),
         ("sweep tiny.toml --jobs 0", 2, "--jobs is 0: it must be at least 1"),
+        ("sweep tiny.toml --on nowhere", 2, "on is 'nowhere': runs are trained on local, slurm"),
         ("sweep tiny.toml --together 0", 2, "together is 0: it must be at least 1"),
         ("sweep tiny.toml --trails 3", 2, "did you mean '--trials'?"),
         ("sweep tiny.toml --path full", 1, "full is not empty and no sweep (it holds mine)"),
@@ -402,8 +405,6 @@ def test_the_best_settings_train_the_same_run(alone, credo, monkeypatch):
 
 
 def test_a_finished_sweep_trains_no_more(alone, credo, monkeypatch):
-    from credo.executors import local
-
     monkeypatch.chdir(alone)
     monkeypatch.setattr(local, "_start", None)
     before = outcome(PLAN)
@@ -417,7 +418,7 @@ def test_a_finished_sweep_trains_no_more(alone, credo, monkeypatch):
 def test_help_shows_how_to_search(credo):
     code, out, _ = credo("sweep --help")
     assert code == 0
-    for flag in ("path", "jobs", "best", "trials", "seeds", "sampler", "together", "startup"):
+    for flag in ("path", "jobs", "best", "trials", "seeds", "sampler", "together", "on"):
         assert f"\n  --{flag} " in out
     code, out, _ = credo("sweep")
     assert code == 2

@@ -143,6 +143,7 @@ def test_a_process_that_dies_is_told_and_replaced(tmp_path, monkeypatch):
     assert str(error.value) == (
         f"1 of 3 runs failed:\n{jobs[0].path}: its process ended with exit code -9"
     )
+    assert error.value.failures == {jobs[0].path: "its process ended with exit code -9"}
     assert [process.returncode for process in started] == [-9, 0]
 
 

@@ -217,6 +217,9 @@ def test_what_fails_is_told_by_the_next_command(slurm, capfd):
     pending(wanted)
     assert slurm.run(1, 0) == 1
     told = "runs/bad: ValueError: depth is 0: it must be at least 1"
+    with pytest.raises(executors.RunsFailed, match=f"1 of 1 runs failed:\n{told}"):
+        executors.run(wanted, on=SUBMIT, retry=False)
+    assert slurm.arrays() == [1]
     assert "submitted 1 run as job array 2 of Slurm" in pending(wanted)
     err = capfd.readouterr().err
     assert f"credo: failed on Slurm and tried again:\n{told}" in err

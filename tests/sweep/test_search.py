@@ -1,5 +1,6 @@
 """The search itself, with a formula in place of training: what is drawn, pruned, told and kept."""
 
+import collections
 import contextlib
 import dataclasses
 import json
@@ -11,7 +12,8 @@ import sys
 
 import pytest
 
-from credo.executors.local import Job
+from credo.executors import Job
+from credo.executors.jobs import Pending
 from credo.runs.options import RunOptions
 from credo.runs.record import RunError
 from credo.sweep import search
@@ -46,7 +48,7 @@ class Formula(search.Search):
         super().__init__(folder, journal, lambda drawn: search.Setup(drawn, RunOptions(), 5))
         self.formula, self.order, self.trained = formula, order, []
 
-    def _train(self, jobs, title):
+    def _train(self, jobs, title, *, retry):
         failed = {}
         for job in list(jobs)[:: self.order]:
             self.trained.append(job.path)
@@ -206,7 +208,12 @@ def test_more_trials_are_those_of_a_longer_sweep(plain, tmp_path):
 def test_seeds_are_trained_one_after_the_other_where_trials_can_be_pruned(tmp_path):
     sweep, calls = Formula(tmp_path, dataclasses.replace(PLAN, trials=6)), []
     train = sweep._train
-    sweep._train = lambda jobs, title: calls.append((title, len(jobs))) or train(jobs, title)
+
+    def noted(jobs, title, **how):
+        calls.append((title, len(jobs)))
+        return train(jobs, title, **how)
+
+    sweep._train = noted
     sweep.run()
     assert calls[0] == ("trials 0 to 2, of 6", 9)  # none of these can be
     assert ("trials 3 to 5, of 6", 3) in calls
@@ -262,17 +269,73 @@ def test_the_best_is_complete_and_of_equal_ones_the_first():
 
 def test_what_fails_is_tried_once_more(tmp_path, plain):
     """A run whose process was killed for want of memory, say, is no worse for it."""
-    seen = set()
+    tries = collections.Counter()
 
     class Flaky(Formula):
-        def _train(self, jobs, title):
-            failed = {job.path: "its process ended" for job in jobs if job.path not in seen}
-            seen.update(job.path for job in jobs)
-            return failed or super()._train(jobs, title)
+        def _train(self, jobs, title, *, retry):
+            tries.update(job.path for job in jobs)
+            failed = {job.path: "its process ended" for job in jobs if tries[job.path] == 1}
+            return failed or super()._train(jobs, title, retry=retry)
 
     sweep = Flaky(tmp_path)
     sweep.run()
     assert sweep.journal.trials == plain
+    assert set(tries.values()) == {2}
+    assert list(tmp_path.rglob("*.again")) == []
+
+
+def test_a_second_try_that_was_killed_is_no_first_one(tmp_path, plain):
+    tries, kill = collections.Counter(), [True]
+
+    class Dying(Formula):
+        def _train(self, jobs, title, *, retry):
+            tries.update(job.path for job in jobs)
+            if retry and kill[0]:
+                kill[0] = False
+                raise Killed
+            return super()._train(jobs, title, retry=retry)
+
+    with pytest.raises(Killed):
+        Dying(tmp_path).run()
+    marks = list(tmp_path.rglob("*.again"))
+    assert {mark.read_text()[:20] for mark in marks} == {"RunError: no numbers"}
+    sweep = Dying(tmp_path)
+    sweep.run()
+    assert sweep.journal.trials == plain
+    assert max(tries.values()) == 3  # the first, the one that was killed, and the next command's
+    assert list(tmp_path.rglob("*.again")) == []
+
+
+def test_on_a_cluster_each_command_does_what_can_be_done(tmp_path, plain):
+    """As with Slurm: what is submitted ends after the command, and a failure stays until it is
+    submitted again."""
+    queued, failed = {}, {}
+
+    class Cluster(Formula):
+        def _train(self, jobs, title, *, retry):
+            new = [job for job in jobs if not (job.path / "score").exists()]
+            told = {job.path: failed[job.path] for job in new if job.path in failed}
+            if retry:
+                told = {}
+            queued.update({job.path: job for job in new if job.path not in told})
+            if queued:
+                raise Pending("submitted")
+            return told
+
+    commands = 0
+    while True:
+        sweep = Cluster(tmp_path)
+        try:
+            sweep.run()
+            break
+        except Pending:
+            commands += 1
+            assert commands < 50
+        failed |= Formula._train(sweep, list(queued.values()), "", retry=False)
+        queued.clear()
+    assert sweep.journal.trials == plain
+    assert commands > 10
+    assert list(tmp_path.rglob("*.again")) == []
 
 
 def test_a_score_that_is_no_number_is_a_failure(tmp_path):
@@ -335,7 +398,7 @@ def test_other_errors_are_nobodys_failure(tmp_path, monkeypatch):
     """A folder with another run, say: it says nothing of the trial."""
 
     class Occupied(Formula):
-        def _train(self, jobs, title):
+        def _train(self, jobs, title, *, retry):
             raise RunError("trial-000/seed-5 holds a run with other settings")
 
     with pytest.raises(RunError, match="holds a run with other settings"):

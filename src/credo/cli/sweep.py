@@ -7,6 +7,7 @@ import pathlib
 from collections.abc import Iterator
 
 from .. import require
+from ..executors import Place
 from ..runs.record import RunError
 from ..sweep.plan import Plan
 from ..sweep.space import Drawn, corners
@@ -29,13 +30,15 @@ class Sweep:
     """Folder of the sweep, new, empty, or begun with this file: then it goes on. None: runs/ and
     the name of the file."""
     jobs: int | None = None
-    """Processes at a time, at least 1; no result depends on it. None: one per core."""
+    """Runs at a time, at least 1; no result depends on it. None: one per core, or elsewhere as many
+    as there is room for."""
     best: pathlib.Path | None = None
     """Write the settings of the best trial so far to this TOML file, for credo train --config, and
     train nothing. None: search."""
     trust: bool = False
     """Import the code that FILE names. Without this such a file is refused: to import a module is
     to execute it."""
+    place: Place = Place()  # noqa: RUF009
 
     def __post_init__(self):
         require.at_least("jobs", self.jobs, 1)
@@ -85,8 +88,8 @@ class Sweep:
         with _owned(folder):
             settle(folder, file, plan, trust=self.trust)
             book = journal.Journal(folder, plan, trials.ranges, owned=True)
-            again = f"credo sweep {folder}"
-            searching = search.Search(folder, book, make, workers=self.jobs, again=again)
+            how = {"on": self.place, "workers": self.jobs, "again": f"credo sweep {folder}"}
+            searching = search.Search(folder, book, make, **how)
             searching.run(lambda: page.write(folder, book, what, seeds))
             written = page.write(folder, book, what, seeds)
             top = journal.best(book.trials, plan)

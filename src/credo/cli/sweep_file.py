@@ -21,12 +21,13 @@ from .names import ALGORITHMS, fail
 from .values import leaves
 
 NAME = "sweep.toml"
+WHERE = "where runs are trained is for the command line alone: credo sweep FILE --on PLACE"
 EACH = "the same for every trial: set it above [ranges]"
 REFUSED = {  # settings of a training that a sweep sees to
     "seeds": "how many a trial has is said in [sweep]",
     "path": "where runs lie is for the sweep to say: credo sweep FILE --path FOLDER",
     "wall-clock": "what a run reaches in a time is not the same twice: give frames or generations",
-}
+} | dict.fromkeys(("on", "submit", "slurm", "ray"), WHERE)
 SETTLED = {  # what cannot be drawn
     "algorithm": f"an algorithm is {EACH}",
     "task": f"a task is {EACH}",

@@ -8,11 +8,12 @@ from .places import Place as Place
 if TYPE_CHECKING:
     from .base import run as run
     from .jobs import Job as Job
+    from .jobs import RunsFailed as RunsFailed
 
 
 def __getattr__(name: str):
     # Workers, which choose their core before JAX is imported, are a module of this package.
-    module = {"run": "base", "Job": "jobs"}.get(name)
+    module = {"run": "base", "Job": "jobs", "RunsFailed": "jobs"}.get(name)
     if module is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f".{module}", __name__), name)

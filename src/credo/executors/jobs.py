@@ -134,15 +134,24 @@ class Job:
 class Ending(NamedTuple):
     """How the training of some jobs ended.
 
-    `failures`: a line for each job that failed, with its path. `signal`: the number of the signal
+    `failures`: why jobs failed, by the folders of their runs. `signal`: the number of the signal
     that stopped it, everything saved; 0: none did. `pending`: what is still to happen elsewhere, in
     words; "": nothing. `lost`: why the place is gone, in words; "": it is not.
     """
 
-    failures: list[str]
+    failures: dict[pathlib.Path, str]
     signal: int = 0
     pending: str = ""
     lost: str = ""
+
+
+class RunsFailed(RunError):
+    """Some of many runs failed, and all were tried. `failures`: as in `Ending`."""
+
+    def __init__(self, failures: dict[pathlib.Path, str], total: int):
+        told = "\n".join(f"{path}: {why}" for path, why in failures.items())
+        super().__init__(f"{len(failures)} of {total} runs failed:\n{told}")
+        self.failures = failures
 
 
 class Pending(RunError):

@@ -9,6 +9,7 @@ new worker takes the next.
 
 import contextlib
 import json
+import pathlib
 import select
 import subprocess
 from collections.abc import Sequence
@@ -45,12 +46,12 @@ class _Crew:
     """Workers that take jobs until there are none.
 
     - `queue`: jobs that no worker had yet; `under_way`: workers with their jobs.
-    - `failures`: a line for each job that failed: its path and what its worker said.
+    - `failures`: what its worker said of each job that failed, by the folder of its run.
     """
 
     def __init__(self, jobs: Sequence[Job], title: str):
         self.queue, self.board = iter(jobs), Board(title, len(jobs))
-        self.under_way, self.failures = list[_Worker](), list[str]()
+        self.under_way, self.failures = list[_Worker](), dict[pathlib.Path, str]()
         self.signals = Signals(quiet=False, end=self.end)
 
     def work(self, number: int) -> int:
@@ -93,7 +94,7 @@ class _Crew:
             answer = _answer(process)
             self.under_way.remove(one)
             if "error" in answer:
-                self.failures.append(f"{job.path}: {answer['error']}")
+                self.failures[job.path] = answer["error"]
             if not self.signals.received:  # else it was stopped and saved, not finished
                 self.board.over(job)
             if "error" in answer:

@@ -63,8 +63,8 @@ class _Crew:
 
     - `queue`: jobs that Ray was not given yet; `under_way`: tasks with their jobs; `trained`: jobs
       whose tasks ended well.
-    - `failures`: a line for each job that failed. `lost`: why there is no cluster any more, in
-      words.
+    - `failures`: why jobs failed, by the folders of their runs. `lost`: why there is no cluster any
+      more, in words.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class _Crew:
     ):
         self.ray, self.queue, self.marks = ray, iter(jobs), marks
         self.under_way, self.trained = dict[Any, Job](), list[Job]()
-        self.failures, self.lost = list[str](), ""
+        self.failures, self.lost = dict[pathlib.Path, str](), ""
         self.board, self.signals = Board(title, len(jobs)), Signals(quiet=False)
         try:
             self.remote = ray.remote(**needs)(node.train)
@@ -128,7 +128,7 @@ class _Crew:
             if not self.signals.received:  # else it was stopped and saved, not finished
                 self.board.over(job)
                 if "error" in answer:
-                    self.failures.append(f"{job.path}: {answer['error']}")
+                    self.failures[job.path] = answer["error"]
                 else:
                     self.trained.append(job)
         self.give(number)

@@ -36,9 +36,12 @@ exec {python} -P {program} {folder}
 """
 
 
-def train(jobs: Sequence[Job], workers: int | None, place: Place, title: str) -> Ending:
+def train(
+    jobs: Sequence[Job], workers: int | None, place: Place, title: str, *, retry: bool = True
+) -> Ending:
     """Write a job array for the jobs that Slurm does not have yet, `workers` at a time; None: as
-    many as Slurm lets. Submit it if the place says so. Says what failed of earlier ones.
+    many as Slurm lets. Submit it if the place says so. Says what failed of earlier ones, which are
+    among the jobs of the new one, unless these are not to be tried again (`retry`).
 
     Raises `RunError` if Slurm's commands are not there or fail.
     """
@@ -46,9 +49,12 @@ def train(jobs: Sequence[Job], workers: int | None, place: Place, title: str) ->
     new = [job for job in jobs if _real(job) not in there]
     old = len(jobs) - len(new)
     told = [f"already queued or running: {_runs(old)}"] if old else []
-    if errors := [f"{job.path}: {failed[_real(job)]}" for job in new if _real(job) in failed]:
-        more = "\n".join(errors)
+    failures = {job.path: failed[_real(job)] for job in new if _real(job) in failed}
+    if failures and retry:
+        more = "\n".join(f"{path}: {why}" for path, why in failures.items())
         screen.say(f"credo: failed on Slurm and tried again:\n{more}")
+        failures = {}
+    new = [job for job in new if job.path not in failures]
     if new:
         script, count = _write(new, workers, place, title), _runs(len(new))
         if place.submit:
@@ -56,7 +62,7 @@ def train(jobs: Sequence[Job], workers: int | None, place: Place, title: str) ->
             told.insert(0, f"submitted {count} as job array {number} of Slurm, {script}")
         else:
             told.insert(0, f"wrote {script} for {count}: submit it by sbatch, or give --submit")
-    return Ending([], pending="; ".join(told))
+    return Ending(failures, pending="; ".join(told))
 
 
 def _runs(count: int) -> str:

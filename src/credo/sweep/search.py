@@ -5,6 +5,7 @@ A sweep is a folder:
     sweep.toml         what is searched and how
     journal.log        the trials, as Optuna records them
     trial-007/seed-3/  a run; those of trials that have ended may be removed
+    slurm/             job arrays, if runs are trained by Slurm
     report.html        the page
 
 What a trial draws, and whether it is pruned, follows from the plan and the trials before it. So a
@@ -21,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from ..executors import local
-from ..executors.local import Job, RunsFailed
-from ..runs import screen
+from .. import executors
+from ..executors import Job, Place, RunsFailed
+from ..runs import files, screen
 from ..runs.lock import RunLocked, lock
 from ..runs.options import RunOptions
 from ..runs.record import RunError
@@ -33,6 +34,7 @@ from .plan import Plan
 from .space import Drawn
 
 PATIENCE = 0.2  # seconds between two looks at a run that another process still saves
+AGAIN = ".again"  # behind the name of a run: a file that says why it is tried once more
 FEW = 4  # trials in a row that fail are no accident
 
 
@@ -51,7 +53,7 @@ class Search:
 
     - `make`: the setup of a trial from what it drew; it raises `ValueError` for values that do not
       go together.
-    - `workers`: processes at a time; None: one per core.
+    - `on`: where runs are trained. `workers`: runs at a time; None: as many as there is room for.
     - `again`: what goes on with the sweep, in words.
     """
 
@@ -61,18 +63,19 @@ class Search:
         journal: Journal,
         make: Callable[[Drawn], Setup],
         *,
+        on: Place = Place(),  # noqa: B008
         workers: int | None = None,
         again: str = "the same command",
     ):
         self.folder, self.journal, self.plan = folder, journal, journal.plan
-        self.make, self.workers, self.again = make, workers, again
+        self.make, self.on, self.workers, self.again = make, on, workers, again
 
     def run(self, after: Callable[[], Any] = lambda: None) -> None:
         """Do all trials that have not ended, and call `after` behind each round.
 
         **Raises:** `RunError` if a whole round fails and, with those before it, `FEW` trials at
         least: then the round is not told, and is tried again when the sweep goes on; `Interrupted`
-        after a signal: runs are saved first.
+        after a signal: runs are saved first; `Pending` where runs are trained later, by a cluster.
         """
         number = 0
         while number < self.plan.trials:
@@ -80,10 +83,16 @@ class Search:
             trials = [self.journal.begin(number) for number in numbers]
             if any(trial.state == RUNNING for trial in trials):
                 ended = _Round(self, trials).ended()
+                self._forget_tries(trials)
                 self._require_some(ended)
                 self._tell(trials, ended)
                 after()
             number = numbers.stop
+
+    def _forget_tries(self, trials: Sequence[Trial]) -> None:
+        """Remove what says which runs were tried once more."""
+        for mark in [x for trial in trials for x in self._home(trial).glob(f"*{AGAIN}")]:
+            files.remove(mark)
 
     def _require_some(self, ended: Sequence[Trial]) -> None:
         """Raise if all of a round have failed, and enough before them."""
@@ -106,31 +115,38 @@ class Search:
 
     def jobs(self, trial: Trial) -> list[Job]:
         """The runs of a trial, one for each seed. Raises what `make` raises."""
-        setup, folder = self.make(trial.drawn), self.folder / f"trial-{trial.number:03}"
+        setup, folder = self.make(trial.drawn), self._home(trial)
         seeds = range(setup.seed, setup.seed + self.plan.seeds)
         how = setup.options, setup.warm_start
         return [Job(folder / f"seed-{seed}", setup.algorithm, seed, *how) for seed in seeds]
 
+    def _home(self, trial: Trial) -> pathlib.Path:
+        """The folder of a trial."""
+        return self.folder / f"trial-{trial.number:03}"
+
     def train(self, jobs: Sequence[Job], title: str) -> Mapping[pathlib.Path, str]:
         """Train unfinished jobs; why some of them failed, by their folders.
 
-        What fails is tried once more: its process may have been short of memory, or the run still
-        held by one that outlived a sweep that was killed.
+        What fails is tried once more, since its process may have been short of memory, say. That it
+        was is said by a file beside the run: the second try may be another command's.
         """
-        failed: Mapping[pathlib.Path, str] = {}
-        for _ in range(2):
+        failed = dict(self._train(jobs, title, retry=False))
+        marks = {job.path: job.path.with_name(job.path.name + AGAIN) for job in jobs}
+        again = [job for job in jobs if job.path in failed and not marks[job.path].exists()]
+        for job in again:
+            files.write_text(marks[job.path], failed.pop(job.path))
+        return failed | (self._train(again, title, retry=True) if again else {})
+
+    def _train(self, jobs: Sequence[Job], title: str, *, retry: bool) -> dict[pathlib.Path, str]:
+        """Where and how runs are trained is said here, and nowhere else in a sweep."""
+        if self.on.kind == "local":  # elsewhere a run waits itself
             for job in jobs:
                 _wait(job.path)
-            failed = self._train(jobs, title)
-            jobs = [job for job in jobs if job.path in failed]
-        return failed
-
-    def _train(self, jobs: Sequence[Job], title: str) -> Mapping[pathlib.Path, str]:
-        """Where and how runs are trained is said here, and nowhere else in a sweep."""
+        how: dict[str, Any] = {"on": self.on, "title": title, "again": self.again}
         try:
-            local.run(jobs, self.workers, title=title, again=self.again)
+            executors.run(jobs, self.workers, retry=retry, **how)
         except RunsFailed as error:
-            return error.reasons
+            return error.failures
         return {}
 
 
