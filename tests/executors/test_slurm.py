@@ -12,7 +12,7 @@ import time
 import pytest
 from standin import Slurm
 
-from credo import executors
+from credo import cli, executors
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.sequence_classification import SequenceClassification
 from credo.executors import Job, Place
@@ -263,3 +263,61 @@ def test_several_seeds_by_the_command_line(slurm, straight, tmp_path):
     assert last.returncode == 0, last.stderr
     assert last.stdout.startswith("runs/seed-0: generation 4000, ")
     assert_same(pathlib.Path("runs"), straight, (0, 1))
+
+
+SWEEP = """
+algorithm = "neuroevolution"
+task = "sequence-classification"
+generations = 20
+depth = 2
+min-gap = 1
+max-gap = 2
+population-size = 10
+episodes = 4
+test-episodes = 6
+network.hidden = 3
+tensorboard = false
+
+[ranges]
+mutation-strength = { low = 1e-3, high = 1.0, log = true }
+
+[sweep]
+trials = 2
+together = 1
+seeds = 2
+startup = 1
+"""
+
+
+@pytest.mark.slow
+def test_a_sweep_takes_a_command_for_each_round_and_each_seed_that_may_be_the_last(slurm, capsys):
+    """The second trial may be pruned after its first seed. The trials are those of a sweep here."""
+    pytest.importorskip("optuna", reason="Optuna is of the extra sweep")
+    pathlib.Path("file.toml").write_text(SWEEP)
+
+    def sweep(words):
+        code = 0
+        try:
+            cli.main(["sweep", "file.toml", *words.split()])
+        except SystemExit as end:  # what is submitted ends the command
+            code = end.code
+        assert code == 0
+        return capsys.readouterr()
+
+    told = []
+    while "page: runs/file/report.html" not in (said := sweep("--on slurm --submit")).out:
+        told.append(said.err)
+        newest = slurm.arrays()[-1]
+        assert {slurm.run(newest, task) for task in slurm.states(newest)} == {0}
+    assert "submitted 2 runs as job array 1 of Slurm" in told[0]
+    assert "credo sweep runs/file submits what stopped, or goes on when every run" in told[0]
+    assert "submitted 1 run as job array 2 of Slurm" in told[1]
+    sweep("--path here")
+    pages = [pathlib.Path(x, "report.html").read_text() for x in ("runs/file", "here")]
+    assert pages[0].replace("runs/file", "here").replace("sweep file", "sweep here") == pages[1]
+    seeds = sorted(pathlib.Path("here").glob("trial-*/seed-*"))
+    assert len(seeds) == len(told) + 1
+    for seed in seeds:
+        for name in ("metrics.csv", "champion.safetensors"):
+            there = pathlib.Path("runs/file") / seed.relative_to("here") / name
+            assert there.read_bytes() == (seed / name).read_bytes()
