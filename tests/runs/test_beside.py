@@ -98,7 +98,23 @@ def test_a_callback_hears_of_a_generation_when_it_is_over(tmp_path):
     assert len(heard) == 3
 
 
-def test_a_dispatch_ends_when_its_time_is_over(tmp_path, monkeypatch, together):
-    monkeypatch.setattr(loop, "PATIENCE", 0.0)
-    trained(EA, tmp_path / "run", generations=3)
+def test_a_dispatch_ends_when_a_checkpoint_is_due(tmp_path, together):
+    trained(EA, tmp_path / "run", generations=3, checkpoint_every=0.0)
     assert set(together) == {1}
+
+
+def test_a_dispatch_that_goes_on_is_reported(tmp_path, monkeypatch, together):
+    silent = trained(EA, tmp_path / "silent", generations=5)
+    monkeypatch.setattr(loop, "PATIENCE", 0.0)
+    told = list[int]()
+    report = loop._Training.report
+
+    def reported(self, rows):
+        told.append(len(rows))
+        return report(self, rows)
+
+    monkeypatch.setattr(loop._Training, "report", reported)
+    run = trained(EA, tmp_path / "run", generations=5)
+    assert told == [1, 1, 1, 1, 1]  # each when its champion has been tested
+    assert 2 in together  # which is beside the next one
+    assert run == silent

@@ -236,6 +236,12 @@ def judged_elsewhere() -> None:
     _OPEN.elsewhere = True
 
 
+def spare(may_be_lost: bool) -> None:
+    """Whether tasks that are opened in this thread from now on need no worker: what ends their
+    process, or hangs in it, then ends this one, and whoever asked for episodes asks again."""
+    _OPEN.spare = may_be_lost
+
+
 class ForeignCopies(AbstractCopies):
     """`n` copies in one worker. Rewards are float64, as Gymnasium has them.
 
@@ -270,7 +276,8 @@ class ForeignCopies(AbstractCopies):
                 if env.here:
                     self._backend = worker.Environments(spec, self.n)
                 else:
-                    self._backend = worker.Process(spec, self.n, env.timeout)
+                    kind = worker.Fatal if _OPEN.spare else worker.Process
+                    self._backend = kind(spec, self.n, env.timeout)
             except worker.Fault as fault:
                 raise UnfitEnvironment(f"{env.id} {fault.what}: {fault.fix}") from fault
             self._finalizer = weakref.finalize(self, self._backend.close, worker.GRACE)
@@ -418,6 +425,7 @@ class _Kept(threading.local):
         self.copies: dict[tuple[AbstractForeignEnvironment, int], ForeignCopies] = {}
         self.tallies: dict[AbstractForeignEnvironment, Tally] = {}
         self.elsewhere = False  # whether failures are judged by another process
+        self.spare = False  # whether this process may be lost with a task
 
 
 _OPEN = _Kept()
@@ -434,6 +442,12 @@ def know(env: AbstractForeignEnvironment, what: tuple[Any, dict[str, Any]]) -> N
     """Take what `told` said in another process; the task need not be opened for it here."""
     names.register(what[0])
     _SIZES[env] = what[1]
+
+
+def close(env: AbstractHostEnvironment) -> None:
+    """End the workers of a task in this thread; asking it for copies again starts others."""
+    for one in [kept for kept in _OPEN.copies if kept[0] == env]:
+        _OPEN.copies.pop(one).close()
 
 
 def close_all() -> None:

@@ -53,7 +53,8 @@ class _Group:
 
     def __init__(self, part: Part, first: int):
         self.lanes = slice(first, first + part.worlds.size)
-        self._form, self._arrays = apart(part.population)
+        self._form, arrays = apart(part.population)
+        self._arrays = jax.device_put(arrays)  # once, not at every step
         self._start = start(self._form, self._arrays, jnp.asarray(part.policies))
         _, actions, *team = part.env.sizes
         self._idle = np.zeros((part.worlds.size, *team, actions), np.float32)
@@ -112,16 +113,34 @@ def shared(parts: Sequence[Part], most: int) -> list[Share]:
         enumerate(parts), key=lambda x: (len(x[1].worlds) > 1, -x[1].worlds.size)
     ):
         members, episodes = part.worlds.shape
-        counts = [0] * most
-        for unit in [2] * (members // 2 - 1) + [2 + members % 2] if members > 1 else [1]:
-            least = load.index(min(load))
-            counts[least] += unit
-            load[least] += unit * episodes
+        counts = _dealt(members, episodes, load)
+        load = [old + episodes * count for old, count in zip(load, counts, strict=True)]
         for k, count in enumerate(counts):
             done = sum(counts[:k])
             if count:
                 shares[k].append((i, _some(part, slice(done, done + count))))
     return [share for share in shares if share]
+
+
+def _dealt(members: int, episodes: int, load: Sequence[int]) -> list[int]:
+    """How many of some members each process plays, to whom so many episodes are given already."""
+    counts = [0] * len(load)
+
+    def busy(k: int) -> tuple[int, bool]:
+        return load[k] + episodes * counts[k], load[k] > 0  # two parts cost more than one
+
+    for _ in range(members):
+        counts[min(range(len(load)), key=busy)] += 1
+    while members > 1 and 1 in counts:
+        lone = counts.index(1)
+        others = [k for k, count in enumerate(counts) if count and k != lone]
+        rich = [k for k in others if counts[k] > 2]
+        heir, giver = min(others, key=busy), max(rich, key=busy, default=None)
+        if giver is None or busy(heir) <= busy(lone):
+            counts[heir], counts[lone] = counts[heir] + 1, 0
+        else:
+            counts[giver], counts[lone] = counts[giver] - 1, 2
+    return counts
 
 
 def _some(part: Part, members: slice) -> Part:

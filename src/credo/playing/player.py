@@ -1,5 +1,6 @@
 """A process that plays one share after another (see `players`): pickles in, pickles out, each
-behind its length. It computes on one core, and ends when its input does.
+behind its length, and what comes in behind a byte as well, 1 if this process is to be spared. It
+computes on one core, in one thread, and ends when its input does.
 
 What it reads is from the process that started it, and what it writes is read by that one alone.
 """
@@ -13,6 +14,7 @@ from typing import Any
 from ..environments import processes
 
 LENGTH = struct.Struct("=Q")
+ASKED = struct.Struct("=?Q")  # whether the task may not end this process, and the length
 
 
 def main() -> None:
@@ -20,14 +22,20 @@ def main() -> None:
     processes.settle()
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever prints must not look like an answer
+    import jax
+
     from ..compilation import enable_cache, float32
     from ..environments import foreign
 
+    # On its one core a second thread would only have to be waited for, at every step.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     enable_cache()
     foreign.judged_elsewhere()
     with float32():
-        while head := sys.stdin.buffer.read(LENGTH.size):
-            body = sys.stdin.buffer.read(*LENGTH.unpack(head))
+        while head := sys.stdin.buffer.read(ASKED.size):
+            spared, length = ASKED.unpack(head)
+            foreign.spare(not spared)
+            body = sys.stdin.buffer.read(length)
             message = pickle.dumps(_answer(body), protocol=5)
             answers.write(LENGTH.pack(len(message)))
             answers.write(message)

@@ -2,9 +2,10 @@
 
 Whatever is asked for by the time the first outcome is wanted is played together, lane beside lane:
 so the champion's test costs a population's rollout little. How many processes there are changes no
-bit. A player holds JAX on one thread and, in a worker of its own, the environments; it is begun
-when this process has played for `PATIENCE` seconds by itself, so that short runs pay nothing. One
-that dies is begun anew, and plays its share again.
+bit. A player holds JAX on one thread and the environments, without a worker between, which a step
+would have to wait for; it is begun when this process has played for `PATIENCE` seconds by itself,
+so that short runs pay nothing. One that dies is begun anew, and plays its share again; in case the
+task was the reason, from then on the task has a worker, that can tell.
 """
 
 import contextlib
@@ -20,11 +21,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..environments import foreign
+from ..environments import foreign, worker
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..environments.processes import Child, cores
 from . import Outcome, Part, Share, joined, play, player, shared
-from .player import LENGTH
+from .player import ASKED, LENGTH
 
 PATIENCE = 2.0  # seconds of playing here before others are asked
 TRIES = 3  # of a share whose player dies
@@ -57,6 +58,7 @@ class Players:
         self._all: list[_Player | None] = [None] * number
         self._waiting: list[weakref.ref[Asked]] = []
         self._away: _Batch | None = None  # what the processes play just now
+        self._suspects: set[AbstractHostEnvironment] = set()  # tasks with which a process died
 
     def ask(self, part: Part) -> Asked:
         """Ask for episodes, which others may be played with."""
@@ -93,8 +95,8 @@ class Players:
         return tasks
 
     def _play(self, together: list[Asked]) -> None:
-        """Play it, here or shared out."""
-        if batch := self._sent(together, least=2):
+        """Play it, here or shared out; a lone share goes out only where there is somebody."""
+        if batch := self._sent(together, least=1 if any(self._all) else 2):
             self._take(batch)
             return
         began = time.monotonic()
@@ -115,18 +117,19 @@ class Players:
         except _Unknown:
             self.number = 1
             return None
+        foreign.close(env)  # here it will not be played any more
         with self._or_close():
             for i in range(len(shares)):
                 self._begun(i)  # all at the same time, before the first is spoken to
             for i, message in enumerate(batch.messages):
-                self._begun(i).give(message)
+                self._begun(i).give(message, env in self._suspects)
         return batch
 
     def _take(self, batch: "_Batch") -> None:
         """The outcomes of what was sent."""
         try:
             with self._or_close():
-                answers = [self._taken(i, message) for i, message in enumerate(batch.messages)]
+                answers = [self._taken(i, batch) for i in range(len(batch.messages))]
         except _Unknown:
             self.number = 1
             return self._play(batch.asked)
@@ -157,7 +160,7 @@ class Players:
             one = self._all[i] = _Player()
         return one
 
-    def _taken(self, i: int, message: bytes) -> tuple[list[Outcome], list[str]]:
+    def _taken(self, i: int, batch: "_Batch") -> tuple[list[Outcome], list[str]]:
         """What came of the share that player `i` was given, and how its episodes ended."""
         for _ in range(TRIES):
             one = self._all[i]
@@ -165,7 +168,8 @@ class Players:
             if answer is not None:
                 return _heard(answer)
             self._drop(i)
-            self._begun(i).give(message)
+            self._suspects.add(batch.asked[0].part.env)
+            self._begun(i).give(batch.messages[i], spared=True)
         raise RuntimeError(
             f"a process that plays episodes ended {TRIES} times over the same ones: give it more "
             "memory, or --processes 1 to see what happens"
@@ -202,14 +206,17 @@ class _Player(Child):
 
     def __init__(self):
         pipe = subprocess.PIPE
-        super().__init__(player.__name__, opening=True, stdin=pipe, stdout=pipe)
+        super().__init__(
+            player.__name__, opening=True, stdin=pipe, stdout=pipe, env=worker.one_thread()
+        )
         assert self.stdin is not None
         assert self.stdout is not None
         self._to, self._from = self.stdin, self.stdout
 
-    def give(self, message: bytes) -> None:
+    def give(self, message: bytes, spared: bool) -> None:
+        """A share to play; `spared`: the task must not end the process."""
         with contextlib.suppress(BrokenPipeError):  # it is dead, and `take` hears of it
-            self._to.write(LENGTH.pack(len(message)))
+            self._to.write(ASKED.pack(spared, len(message)))
             self._to.write(message)
             self._to.flush()
 

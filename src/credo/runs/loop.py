@@ -45,7 +45,7 @@ from .trust import seal, short, signed_here
 
 CHUNK = 64  # generations in one dispatch, at most
 DISPATCH = 0.3  # seconds that one dispatch should last
-PATIENCE = 10.0  # seconds after which one outside JAX ends with its generation
+PATIENCE = 5.0  # seconds between two reports of one outside JAX
 MOST = 2**31 - 1  # what 32 bits hold
 
 
@@ -454,14 +454,9 @@ class _Training:
         self.tick = time.monotonic()
         rows = self.play()
         self.require_sound()
-        now = time.monotonic()
-        seconds = now - self.tick
-        self.journal.append(rows, seconds, self.before + now - self.began)
-        self.bar.update(self.generation, rows[-1], seconds)
-        limit = self.options.wall_clock
-        if self.listeners.hear(rows):
-            self.ended = "callback"
-        elif limit is not None and now - self.began >= limit:
+        seconds = self.report(rows)
+        now, limit = self.tick, self.options.wall_clock
+        if not self.ended and limit is not None and now - self.began >= limit:
             self.ended = "wall clock"
         self.reached = self.budget.reached(self.generation, self.frames, rows[-1]["champion_score"])
         if now - self.last_save >= self.options.checkpoint_every:
@@ -472,12 +467,29 @@ class _Training:
         again = int(np.clip(len(rows) * DISPATCH / seconds, 1, CHUNK))
         self.chunk = 2 if self.chunk == 1 else again
 
+    def report(self, rows: list[dict[str, Any]]) -> float:
+        """Write and tell of some generations; how many seconds they took. Raises `OSError`."""
+        now = time.monotonic()
+        seconds, self.tick = now - self.tick, now
+        self.journal.append(rows, seconds, self.before + now - self.began)
+        self.bar.update(rows[-1]["generation"], rows[-1], seconds)
+        if self.listeners.hear(rows):
+            self.ended = "callback"
+        return seconds
+
+    def overdue(self, rows: list[dict[str, Any]]) -> bool:
+        """Report these generations of a dispatch that goes on, if it is time; whether it was."""
+        due = bool(rows) and time.monotonic() - self.tick >= PATIENCE
+        if due:
+            self.report(rows)
+        return due
+
     def play(self) -> list[dict[str, Any]]:
         """The next generations; a row of metrics for each."""
         at = (self.algorithm, self.state, self.best, self.root, self.generation, self.frames)
         try:
             if isinstance(self.algorithm.env, AbstractHostEnvironment):
-                played = play_outside(*at, self.budget, self.enough)
+                played = play_outside(*at, self.budget, self.enough, self.overdue)
             else:
                 played = play(*at, self.chunk, self.budget)
             self.state, self.best, rows = played
@@ -493,11 +505,9 @@ class _Training:
     def enough(self) -> bool:
         """Whether a dispatch outside JAX is to end with the generation that it has just played."""
         now, limit = time.monotonic(), self.options.wall_clock
-        since = now - max(self.tick, self.last_save)
         return (
             self.signals.received > 0
-            or now - self.tick >= PATIENCE
-            or since >= self.options.checkpoint_every
+            or now - self.last_save >= self.options.checkpoint_every
             or (limit is not None and now - self.began >= limit)
             or self.budget.stop_at is not None
             or bool(self.options.callbacks)  # each is to hear of a generation when it is over
@@ -592,8 +602,10 @@ def play_outside(
     frames: int,
     budget: Budget,
     enough: Callable[[], bool],
+    overdue: Callable[[list[dict[str, Any]]], bool],
 ) -> tuple[PyTree, Best, list[dict[str, Any]]]:
     """`play` of a task outside JAX: generations until one is `enough` or the budget is reached.
+    Rows that are whole and `overdue` are not returned: that has taken them.
 
     The test of each champion is played beside the next generation's episodes, so its score is put
     into its row, and into the state, one generation late (`rollout.score`); that of the last
@@ -625,6 +637,8 @@ def play_outside(
             # A generation that made no test of its own repeats the score.
             state, best = settle(state, best, slice(-2, -1 if postponed else None))
             waiting = None
+        if overdue(rows[:-1]):
+            rows = rows[-1:]
         arrays = Best.none(eqx.filter(state.champion, eqx.is_array)).policy
         if postponed:
             waiting = postponed[-1], arrays
