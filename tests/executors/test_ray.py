@@ -13,6 +13,7 @@ import pytest
 
 from credo import executors
 from credo.algorithms.neuroevolution import Neuroevolution
+from credo.environments import cluster as clusters
 from credo.environments.sequence_classification import SequenceClassification
 from credo.executors import Job, Place, node
 from credo.networks.mmu import MMU
@@ -45,9 +46,9 @@ def test_a_node_says_why_it_cannot_train(tmp_path):
     with lock.lock(tmp_path / "mark"):
         assert node.blind(mark, home) == ""
         assert node.blind(mark, home + "/gone").startswith(f"has no folder {home}/gone, ")
-        assert node.look([mark], home, node.versions()) == ""
-        other = node.versions() | {"jax": "0.1"}
-        jax = node.versions()["jax"]
+        assert node.look([mark], home, clusters.versions()) == ""
+        other = clusters.versions() | {"jax": "0.1"}
+        jax = clusters.versions()["jax"]
         assert node.look([mark], home, other).startswith(f"has jax {jax}, not 0.1: ")
     assert node.blind(mark, home).startswith("does not see that the command locked a file in ")
 
@@ -302,7 +303,7 @@ def test_what_fails_on_this_machine_alone_is_told(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_head_that_is_lost_is_named_and_another_cluster_goes_on(cluster, straight):
-    soon, address = "import credo.executors.ray as ray; ray.HEAD = 1.0", cluster.address
+    soon, address = "import credo.environments.cluster as ray; ray.HEAD = 1.0", cluster.address
     with Command(f"ray:{address}", before=soon) as command:
         command.wait_until(both_under_way)
         trainers = [trainer(0), trainer(1)]

@@ -19,7 +19,7 @@ from credo.evolution.breeder import draw
 from credo.networks.mlp import MLP, MLPPolicy
 from credo.networks.mmu import MMU
 from credo.networks.team import Team
-from credo.playing import Outcome, Part, joined, play, players, shared
+from credo.playing import Outcome, Part, cut, joined, local, play, players, shared
 
 TASK = Gymnasium("Pendulum-v1", max_episode_steps=15)
 ENVIRONMENTS = str(pathlib.Path(__file__).parents[1] / "environments")
@@ -33,10 +33,15 @@ def _environments():
     foreign.close_all()
 
 
+def hasty(number):
+    """Players that are asked at once."""
+    return players.Players(local.Processes(number), patience=0.0)
+
+
 @pytest.fixture(scope="module")
 def crew():
     """Three processes, which are asked at once."""
-    crew = players.Players(3, patience=0.0)
+    crew = hasty(3)
     yield crew
     crew.close()
 
@@ -45,7 +50,7 @@ def played(env, network, members=7, episodes=2, crew=None, **how):
     """A rollout of fresh policies; by `crew`, or by this process."""
     population = draw(network, env.sizes, members, key=jax.random.key(0))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(players._CURRENT, "players", crew or players.Players(1))
+        patch.setattr(players._CURRENT, "players", crew or players.Players())
         return rollout.collect(env, population, episodes, key=jax.random.key(1), **how)
 
 
@@ -78,7 +83,7 @@ def same(a, b) -> bool:
 def test_their_number_changes_no_bit(env, network, crew):
     alone = played(env, network)
     assert same(alone, played(env, network, crew=crew))
-    assert sum(one is not None for one in crew._all) == 3
+    assert sum(one is not None for one in crew.crew.all) == 3
     assert same(played(env, network, limit=4), played(env, network, limit=4, crew=crew))
     assert same(played(env, network, wanted=1), played(env, network, wanted=1, crew=crew))
 
@@ -91,18 +96,18 @@ def test_no_member_is_alone_and_all_are_there():
     for most in range(1, 9):
         shares = shared([population], most)
         assert len(shares) == min(most, 3)
-        slices = [part for share in shares for _, part in share]
+        slices = [part for share in shares for part in cut([population], share)]
         assert min(len(x.worlds) for x in slices) >= 2
         assert np.concatenate([x.population["w"] for x in slices]).tolist() == list(range(7))
         assert np.concatenate([x.worlds for x in slices]).tolist() == worlds.tolist()
         assert len(shared([champion], most)) == 1
         both = shared([population, champion], most)
-        lanes = [sum(part.worlds.size for _, part in share) for share in both]
+        lanes = [sum(x.worlds.size for x in cut([population, champion], y)) for y in both]
         assert sum(lanes) == 19
         assert most > 3 or max(lanes) - min(lanes) <= 4  # of two members at most
-        assert sorted({i for share in both for i, _ in share}) == [0, 1]
+        assert sorted({i for share in both for i, *_ in share}) == [0, 1]
     ten = dataclasses.replace(population, worlds=np.zeros((10, 1), np.uint32))
-    assert [[len(x.worlds) for _, x in share] for share in shared([ten], 2)] == [[5], [5]]
+    assert shared([ten], 2) == [[(0, 0, 5)], [(0, 5, 10)]]
     two = [Outcome({"r": np.full((n, 2), n)}, np.full((n, 2), n), None) for n in (2, 3)]
     assert joined(two).steps[:, 0].tolist() == [2, 2, 3, 3, 3]
 
@@ -149,7 +154,7 @@ def test_what_nobody_wants_any_more_is_not_played():
             self.together = (*self.together, len(together))
             super()._play(together)
 
-    crew, one = Counting(1), part(TASK, MLP(hidden=(4,)), 2)
+    crew, one = Counting(), part(TASK, MLP(hidden=(4,)), 2)
     forgotten, wanted = crew.ask(one), crew.ask(one)
     del forgotten
     wanted.result()
@@ -163,7 +168,7 @@ def test_what_nobody_wants_any_more_is_not_played():
 def test_who_asks_again_after_a_failure_is_answered():
     kwargs = {"every": 1, "fault": "nan", "at": 2}
     task = Gymnasium("failing:Rare", kwargs=kwargs, max_episode_steps=6, tolerated=0.0)
-    crew, network = players.Players(1), MLP(hidden=(4,))
+    crew, network = players.Players(), MLP(hidden=(4,))
     one, other = crew.ask(part(task, network, 2)), crew.ask(part(task, network, 2))
     with pytest.raises(EnvironmentFailure):
         one.result()
@@ -173,7 +178,7 @@ def test_who_asks_again_after_a_failure_is_answered():
 
 def test_one_that_dies_plays_its_part_again(crew, monkeypatch):
     alone, killed = played(TASK, MLP(hidden=(16,))), []
-    give = players._Player.give
+    give = local._Player.give
 
     def given(self, message, spared):
         give(self, message, spared)
@@ -181,10 +186,10 @@ def test_one_that_dies_plays_its_part_again(crew, monkeypatch):
             killed.append(self.pid)
             os.kill(self.pid, signal.SIGKILL)
 
-    monkeypatch.setattr(players._Player, "give", given)
+    monkeypatch.setattr(local._Player, "give", given)
     assert same(alone, played(TASK, MLP(hidden=(16,)), crew=crew))
     assert killed
-    assert killed[0] not in [one.pid for one in crew._all]
+    assert killed[0] not in [one.pid for one in crew.crew.all]
 
 
 @pytest.mark.parametrize("fault", ["dies", "holds", "leaves_a_child"])
@@ -192,24 +197,26 @@ def test_a_task_that_ends_its_process_costs_the_episode_alone(fault):
     # One episode in nine ends the process that plays them, and with it all others there.
     kwargs = {"every": 9, "fault": fault, "at": 2}
     task = Gymnasium("failing:Rare", kwargs=kwargs, max_episode_steps=6, tolerated=1.0, timeout=1.0)
-    crew = players.Players(2, patience=0.0)
+    crew = hasty(2)
     try:
         returns = played(task, MLP(hidden=(4,)), 4, common=False, crew=crew)[0].of("reward")
         assert crew._suspects == {task}
         assert np.isnan(returns).any()
         again = played(task, MLP(hidden=(4,)), 4, common=False, crew=crew)[0].of("reward")
         assert np.isnan(again).any()
-        assert all(one is not None and not one.over(0.0) for one in crew._all)  # they have a worker
+        assert all(
+            one is not None and not one.over(0.0) for one in crew.crew.all
+        )  # they have a worker
     finally:
         crew.close()
 
 
 def test_one_that_dies_again_and_again_is_named(monkeypatch):
-    crew = players.Players(2, patience=0.0)
-    monkeypatch.setattr(players._Player, "take", lambda self: None)
+    crew = hasty(2)
+    monkeypatch.setattr(local._Player, "take", lambda self: None)
     with pytest.raises(RuntimeError, match=r"ended 3 times over the same ones: .*--processes 1"):
         played(TASK, MLP(hidden=(16,)), crew=crew)
-    assert crew._all == [None, None]
+    assert crew.crew.all == [None, None]
 
 
 def test_what_another_process_cannot_have_is_played_here():
@@ -219,13 +226,12 @@ def test_what_another_process_cannot_have_is_played_here():
     alone = played(TASK, MLP(hidden=(4,)))
     own = draw(MLP(hidden=(4,)), TASK.sizes, 7, key=jax.random.key(0))
     fields = {field.name: getattr(own, field.name) for field in dataclasses.fields(own)}
-    hasty = players.Players(2, patience=0.0)
+    soon = hasty(2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(players._CURRENT, "players", hasty)
+        patch.setattr(players._CURRENT, "players", soon)
         mine = rollout.collect(TASK, Policy(**fields), 2, key=jax.random.key(1))
     assert same(alone, mine)
-    assert hasty.number == 1
-    assert hasty._all == [None, None]
+    assert soon.crew is None
 
 
 def test_an_answer_that_nobody_took_is_not_that_to_the_next_part(crew, monkeypatch):
@@ -250,22 +256,26 @@ def test_failures_count_together_wherever_they_were(crew):
 
 
 def test_a_short_run_and_a_lone_member_start_nobody():
-    patient = players.Players(2, patience=3600.0)
+    patient = players.Players(local.Processes(2), patience=3600.0)
     played(TASK, MLP(hidden=(16,)), crew=patient)
-    assert patient._all == [None, None]
-    hasty = players.Players(2, patience=0.0)
-    played(TASK, MLP(hidden=(16,)), members=1, crew=hasty)
+    assert patient.crew.all == [None, None]
+    soon = hasty(2)
+    played(TASK, MLP(hidden=(16,)), members=1, crew=soon)
     for fields in ({"in_process": True}, {"at_once": 4}):
-        played(Gymnasium("Pendulum-v1", max_episode_steps=15, **fields), MLP(), crew=hasty)
-    assert hasty._all == [None, None]
+        played(Gymnasium("Pendulum-v1", max_episode_steps=15, **fields), MLP(), crew=soon)
+    assert soon.crew.all == [None, None]
 
 
 def test_outside_the_block_this_process_plays_alone():
+    def number():
+        crew = players._CURRENT.players.crew
+        return 1 if crew is None else crew.number
+
     with players.using(2):
-        assert players._CURRENT.players.number == 2
+        assert number() == 2
         with players.using(1):
-            assert players._CURRENT.players.number == 1
-        assert players._CURRENT.players.number == 2
-    assert players._CURRENT.players.number == 1
+            assert number() == 1
+        assert number() == 2
+    assert number() == 1
     with players.using(None):
-        assert players._CURRENT.players.number == len(processes.cores())
+        assert number() == len(processes.cores())

@@ -219,8 +219,14 @@ def serve(module: str, path: list[str], opening: bool, arguments: Sequence[str] 
     sys.path[:] = path
     sys.argv = [module, *arguments]
     here: Any = importlib.import_module("credo.environments.processes")
-    here._worker, here._opening = True, opening
+    here.serves(opening)
     importlib.import_module(module).main()
+
+
+def serves(opening: bool) -> None:
+    """From now on this process is one that others give work to (see `allow`)."""
+    global _worker, _opening
+    _worker, _opening = True, opening
 
 
 def _let_go(*kept: int) -> None:

@@ -1,35 +1,31 @@
 """What is done in processes of Ray, on the nodes of a cluster. JAX is not imported there, but in
 their children, which train."""
 
-import importlib.metadata
 import json
 import os
 import pathlib
 import socket
 import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ..environments import cluster
 from ..environments.processes import Child
 from ..runs.lock import RunLocked, lock
 from . import worker
 from .worker import SAVE
 
-PACKAGES = ("credo", "jax", "jaxlib", "numpy")
-
 
 def train(message: str, mark: str, setup: Mapping[str, Any]) -> dict[str, Any]:
     """Train the job of a message in a worker; its answer. After `ray.cancel` it is saved first.
 
-    `mark`: as of `blind`. `setup`: the folder in which the command was given (`home`), where it
-    finds modules (`path`), variables of its environment (`env`), and a worker's `arguments`.
+    `mark`: as of `blind`. `setup`: what `cluster.home` says, and a worker's `arguments`.
     """
     if why := blind(mark, setup["home"]):
         return {"error": f"node {socket.gethostname()} {why}"}
-    sys.path[:] = [*setup["path"], *(x for x in sys.path if x not in setup["path"])]
+    cluster.move_in(setup)
     options = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    options |= {"cwd": setup["home"], "env": os.environ | setup["env"]}
+    options |= {"env": os.environ | setup["env"]}
     process = Child(worker.__name__, *setup["arguments"], grace=SAVE, opening=True, **options)
     try:
         answer, _ = process.communicate(message + "\n")
@@ -45,9 +41,8 @@ def train(message: str, mark: str, setup: Mapping[str, Any]) -> dict[str, Any]:
 def look(marks: Sequence[str], home: str, wanted: Mapping[str, str]) -> str:
     """Why runs cannot be trained on this node as where the command was given, whose versions are
     `wanted`, in words; "" if they can."""
-    pairs = [(name, found, wanted[name]) for name, found in versions().items()]
-    if other := [f"{name} {here}, not {there}" for name, here, there in pairs if here != there]:
-        return f"has {', '.join(other)}: install the same versions on all nodes"
+    if other := cluster.other(wanted):
+        return other
     return next(filter(None, (blind(mark, home) for mark in marks)), "")
 
 
@@ -55,8 +50,8 @@ def blind(mark: str, home: str) -> str:
     """Why this node cannot train runs that lie beside `mark`, a folder that the command made and
     holds the lock of, in words; "" if it can."""
     folder = os.path.dirname(mark)
-    if not os.path.isdir(home):
-        return f"has no folder {home}, in which the command was given: all nodes need it"
+    if why := cluster.homeless(home):
+        return why
     if not os.path.isdir(mark):
         return (
             f"does not see what the command writes into {folder}: runs must be on storage that all "
@@ -71,8 +66,3 @@ def blind(mark: str, home: str) -> str:
             )
     except RunLocked:
         return ""
-
-
-def versions() -> dict[str, str]:
-    """Those that must be the same on all nodes."""
-    return {name: importlib.metadata.version(name) for name in PACKAGES}

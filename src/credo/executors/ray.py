@@ -10,18 +10,14 @@ asked, at the start and before each task.
 
 import contextlib
 import importlib
-import math
 import os
 import pathlib
-import signal
-import socket
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from ..environments import processes
+from ..environments import cluster
 from ..runs import files, screen
 from ..runs.lock import RunLocked, lock
 from ..runs.record import RunError
@@ -33,10 +29,8 @@ from .jobs import PATIENCE, Ending, Job
 from .places import Place
 
 TRIES = 100  # of a job whose process or node dies: more are no bad luck
-HEAD = 40.0  # seconds without its head after which a cluster is given up; after 60 Ray ends us
 SEEN = 70.0  # seconds after which NFS shows what was written on another node
-STORE = 10**8  # bytes of memory for Ray's objects, of which there are hardly any
-TAKEN = ("CREDO_", "JAX_", "XLA_")  # variables of the environment that are so on all nodes
+LEFT = ": runs under way are saved as their nodes end. Start the cluster again"
 MARK = ".credo-"  # before the name of a folder by which nodes show that they see the storage
 
 
@@ -46,16 +40,18 @@ def train(jobs: Sequence[Job], workers: int | None, place: Place, title: str) ->
     Raises `RunError` without Ray or the cluster, and if a node does not see the storage of the
     runs or has other versions.
     """
-    try:
-        ray = importlib.import_module("ray")
-    except ImportError as error:
-        raise RunError("--on ray needs Ray: pip install 'credo[ray]'") from error
     needs = {"num_cpus": 1, "max_retries": TRIES} | place.ray
-    with _connected(ray, place.address, workers, needs) as alone, _marks(jobs) as marks:
-        _check_nodes(ray, list(marks.values()), needs, alone)
-        crew = _Crew(ray, jobs, marks, needs, title)
-        number = crew.work(workers or len(jobs))
-        return Ending(crew.failures, number, lost=crew.lost)
+    if any(job.options.rollouts != "local" for job in jobs):
+        raise RunError("--on ray trains each run in one task: leave --rollouts out")
+    try:
+        ray, room = cluster.library("--on ray"), (workers or 0) * needs["num_cpus"]
+        with cluster.connected(ray, place.address, "--on", room) as alone, _marks(jobs) as marks:
+            _check_nodes(ray, list(marks.values()), needs, alone)
+            crew = _Crew(ray, jobs, marks, needs, title)
+            number = crew.work(workers or len(jobs))
+            return Ending(crew.failures, number, lost=crew.lost)
+    except cluster.ClusterLost as error:
+        raise RunError(str(error)) from error
 
 
 class _Crew:
@@ -78,13 +74,8 @@ class _Crew:
             self.remote = ray.remote(**needs)(node.train)
         except (TypeError, ValueError) as error:
             raise RunError(f"--ray {needs}: {error}") from error
-        self.setup = {
-            "home": os.getcwd(),
-            "path": [os.path.abspath(entry) for entry in sys.path],
-            "env": {name: x for name, x in os.environ.items() if name.startswith(TAKEN)},
-            "arguments": [ALL_CORES] * (needs["num_cpus"] > 1),
-        }
-        self.head = _Head(ray)
+        self.setup = cluster.home() | {"arguments": [ALL_CORES] * (needs["num_cpus"] > 1)}
+        self.head = cluster.Head(ray)
 
     def work(self, number: int) -> int:
         """Do all jobs, so many at a time; the signal that ended it, or 0."""
@@ -99,6 +90,7 @@ class _Crew:
                         self.cancel()  # by which they save
                     self.listen()
                     self.lost = self.head.missing() if self.under_way else ""
+                    self.lost += LEFT if self.lost else ""
                     self.board.show(job for job in self.under_way.values() if _begun(job))
                 self.wait_for_files()
             except SystemExit:  # after a second signal; Ray may have made its code another
@@ -143,7 +135,9 @@ class _Crew:
         try:
             return self.ray.get(task)
         except self.ray.exceptions.RayError as error:
-            return {"error": f"{_brief(error)} What was saved stands: the same command goes on"}
+            return {
+                "error": f"{cluster.brief(error)} What was saved stands: the same command goes on"
+            }
 
     def wait_for_files(self) -> None:
         """Wait for what other nodes wrote to be seen here: NFS may show a folder as it was."""
@@ -151,47 +145,6 @@ class _Crew:
         for job in [job for job in self.trained if job.options.wall_clock is None]:
             while not job.finished() and time.monotonic() < until:
                 time.sleep(1.0)
-
-
-class _Head:
-    """Whether the head of the cluster is there. Ray itself says nothing until it ends the process
-    that asks."""
-
-    def __init__(self, ray: Any):
-        self.address = ray.get_runtime_context().gcs_address
-        self.answered = self.asked = time.monotonic()
-
-    def missing(self) -> str:
-        """Why the cluster is given up, in words; "" as long as there is hope."""
-        now = time.monotonic()
-        if now - self.asked < 1.0:
-            return ""
-        self.asked = now
-        try:
-            _reach(self.address, 1.0)
-            self.answered = now
-        except OSError as error:
-            if now - self.answered > HEAD:
-                return (
-                    f"the head of the Ray cluster at {self.address} has not answered for "
-                    f"{HEAD:.0f} s ({error}): runs under way are saved as their nodes end. Start "
-                    "the cluster again"
-                )
-        return ""
-
-
-def _brief(error: Exception) -> str:
-    """An error of Ray's in a line: what was raised on a node comes last, behind its traceback."""
-    lines = str(error).strip().splitlines() or [""]
-    raised = type(error).__name__.startswith("RayTaskError")
-    return lines[-1] if raised else f"{type(error).__name__}: {lines[0]}"
-
-
-def _reach(address: str, patience: float) -> None:
-    """Raise `OSError` if nothing answers at HOST:PORT within so many seconds, and `ValueError` if
-    the address is none."""
-    host, _, port = address.rpartition(":")
-    socket.create_connection((host.strip("[]"), int(port)), timeout=patience).close()
 
 
 def _begun(job: Job) -> bool:
@@ -207,41 +160,6 @@ def _parent(job: Job) -> str:
 
 
 # Before and after.
-
-
-@contextlib.contextmanager
-def _connected(
-    ray: Any, address: str, workers: int | None, needs: Mapping[str, Any]
-) -> Iterator[bool]:
-    """Use the cluster at an address, or that of $RAY_ADDRESS; without either one of this machine's
-    cores, which ends with the block. One that the caller is connected to already is kept. Yields
-    whether no other machine can join."""
-    if ray.is_initialized():
-        yield False
-        return
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    address = address or os.environ.get("RAY_ADDRESS", "local")
-    how: dict[str, Any] = {"address": address, "logging_level": "WARNING"}
-    if address == "local":
-        room = max(len(processes.cores()), math.ceil((workers or 0) * needs["num_cpus"]))
-        how |= {"num_cpus": room, "include_dashboard": False, "object_store_memory": STORE}
-        how |= {"logging_level": "ERROR"}  # nobody can reach it whom it might warn of
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        try:
-            if address not in ("local", "auto"):
-                _reach(address, 5.0)  # Ray itself would try for minutes
-            ray.init(**how)
-        except (OSError, ValueError) as error:
-            raise RunError(
-                f"no Ray cluster answers at {address}: {error}. Start one (ray start --head), or "
-                "give --on ray, and no RAY_ADDRESS, for this machine alone"
-            ) from error
-        yield address == "local"
-    finally:
-        ray.shutdown()
-        with contextlib.suppress(ValueError):  # in another thread nothing was changed
-            signal.signal(signal.SIGTERM, before)
 
 
 @contextlib.contextmanager
@@ -281,7 +199,7 @@ def _check_nodes(ray: Any, marks: Sequence[str], needs: Mapping[str, Any], alone
         try:
             why = ray.get(task)
         except ray.exceptions.RayError as error:
-            why = f"cannot train: {_brief(error)}"
+            why = f"cannot train: {cluster.brief(error)}"
         if why:
             raise RunError(f"node {found['NodeManagerHostname']} {why}")
 
@@ -291,4 +209,4 @@ def _asked(ray: Any, node_id: str, marks: Sequence[str]) -> Any:
     module = importlib.import_module("ray.util.scheduling_strategies")
     there = module.NodeAffinitySchedulingStrategy(node_id, soft=False)
     look = ray.remote(node.look).options(num_cpus=0, scheduling_strategy=there)
-    return look.remote(marks, os.getcwd(), node.versions())
+    return look.remote(marks, os.getcwd(), cluster.versions())

@@ -98,8 +98,8 @@ def _outcome(part: Part, told: Episodes, lanes: slice) -> Outcome:
     return Outcome(returns, told.steps[lanes].reshape(shape), rows)
 
 
-Share = list[tuple[int, Part]]
-"""What one process plays: slices of parts, by the number of the part."""
+Share = list[tuple[int, int, int]]
+"""What one process plays: of which part, from which member on, and up to which."""
 
 
 def shared(parts: Sequence[Part], most: int) -> list[Share]:
@@ -118,7 +118,7 @@ def shared(parts: Sequence[Part], most: int) -> list[Share]:
         for k, count in enumerate(counts):
             done = sum(counts[:k])
             if count:
-                shares[k].append((i, _some(part, slice(done, done + count))))
+                shares[k].append((i, done, done + count))
     return [share for share in shares if share]
 
 
@@ -141,6 +141,11 @@ def _dealt(members: int, episodes: int, load: Sequence[int]) -> list[int]:
         else:
             counts[giver], counts[lone] = counts[giver] - 1, 2
     return counts
+
+
+def cut(parts: Sequence[Part], share: Share) -> list[Part]:
+    """The slices of a share."""
+    return [_some(parts[i], slice(first, last)) for i, first, last in share]
 
 
 def _some(part: Part, members: slice) -> Part:

@@ -1,17 +1,16 @@
-"""Who plays episodes outside JAX: this process, or several, each on a core of its own.
+"""Who plays episodes outside JAX: this process, or several, here or on a Ray cluster.
 
 Whatever is asked for by the time the first outcome is wanted is played together, lane beside lane:
 so the champion's test costs a population's rollout little. How many processes there are changes no
 bit. A player holds JAX on one thread and the environments, without a worker between, which a step
-would have to wait for; it is begun when this process has played for `PATIENCE` seconds by itself,
-so that short runs pay nothing. One that dies is begun anew, and plays its share again; in case the
-task was the reason, from then on the task has a worker, that can tell.
+would have to wait for; on this machine it is begun when this process has played for `PATIENCE`
+seconds by itself, so that short runs pay nothing. What one that dies was playing is played again;
+in case the task was the reason, from then on the task has a worker, that can tell.
 """
 
 import contextlib
 import dataclasses
 import pickle
-import subprocess
 import threading
 import time
 import weakref
@@ -21,14 +20,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..environments import foreign, worker
+from ..environments import foreign
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
-from ..environments.processes import Child, cores
-from . import Outcome, Part, Share, joined, play, player, shared
-from .player import ASKED, LENGTH
+from ..environments.processes import cores
+from . import Outcome, Part, joined, play, shared
+from .crew import AbstractCrew, Answer, Batch
+from .local import Processes
 
 PATIENCE = 2.0  # seconds of playing here before others are asked
-TRIES = 3  # of a share whose player dies
+
+
+class NotPlayed(RuntimeError):
+    """Those who were asked cannot play this."""
 
 
 class Asked:
@@ -50,14 +53,16 @@ class Asked:
 
 
 class Players:
-    """Up to `number` processes, at least 1: with 1 this one plays all."""
+    """This process, and a crew that plays what is worth sending; None: nobody else.
 
-    def __init__(self, number: int, patience: float | None = None):
-        self.number, self._spent = number, 0.0
+    **Arguments:** `patience`: seconds that this process plays by itself at first.
+    """
+
+    def __init__(self, crew: AbstractCrew | None = None, patience: float | None = None):
+        self.crew, self._spent = crew, 0.0
         self._patience = PATIENCE if patience is None else patience
-        self._all: list[_Player | None] = [None] * number
         self._waiting: list[weakref.ref[Asked]] = []
-        self._away: _Batch | None = None  # what the processes play just now
+        self._away: tuple[list[Asked], Batch] | None = None  # what the crew plays just now
         self._suspects: set[AbstractHostEnvironment] = set()  # tasks with which a process died
 
     def ask(self, part: Part) -> Asked:
@@ -72,15 +77,15 @@ class Players:
             return
         for together in self._drawn():
             if self._away is None and (batch := self._sent(together, least=1)):
-                self._away = batch
+                self._away = together, batch
             else:
                 self._waiting += map(weakref.ref, together)
 
     def settle(self, wanted: Asked) -> None:
         """Play what was asked for, until there is an outcome of this."""
-        batch, self._away = self._away, None
-        if batch is not None:
-            self._take(batch)
+        away, self._away = self._away, None
+        if away is not None:
+            self._take(*away)
         if wanted.outcome is None:
             for together in self._drawn():
                 self._play(together)
@@ -96,53 +101,76 @@ class Players:
 
     def _play(self, together: list[Asked]) -> None:
         """Play it, here or shared out; a lone share goes out only where there is somebody."""
-        if batch := self._sent(together, least=1 if any(self._all) else 2):
-            self._take(batch)
+        if batch := self._sent(together, least=1 if self.crew and self.crew.awake() else 2):
+            self._take(together, batch)
             return
         began = time.monotonic()
         for asked, outcome in zip(together, play([x.part for x in together]), strict=True):
             asked.outcome = outcome
         self._spent += time.monotonic() - began
 
-    def _sent(self, together: list[Asked], least: int) -> "_Batch | None":
-        """One share to each process, `least` or more; None if it must be played here."""
-        env = together[0].part.env
-        if self.number < 2 or self._spent < self._patience or not _sendable(env):
+    def _sent(self, together: list[Asked], least: int) -> Batch | None:
+        """Shares for the crew, `least` or more; None if it must be played here."""
+        env: Any = together[0].part.env
+        if self.crew is None or self._spent < self._patience or not _sendable(env):
             return None
-        shares = shared([asked.part for asked in together], self.number)
+        shares = shared([asked.part for asked in together], self.crew.number)
         if len(shares) < least:
             return None
-        try:
-            batch = _Batch(together, shares, [_told(env, share) for share in shares])
-        except _Unknown:
-            self.number = 1
-            return None
-        foreign.close(env)  # here it will not be played any more
+        batch = Batch([_plain(asked.part) for asked in together], foreign.told(env), shares)
         with self._or_close():
-            for i in range(len(shares)):
-                self._begun(i)  # all at the same time, before the first is spoken to
-            for i, message in enumerate(batch.messages):
-                self._begun(i).give(message, env in self._suspects)
+            try:
+                self.crew.begin(batch)
+                for k in range(len(shares)):
+                    self.crew.give(batch, k, env in self._suspects)
+            except (pickle.PicklingError, AttributeError, TypeError) as error:
+                self._dismiss(str(error))
+                return None
+        foreign.close(env)  # here it will not be played any more
         return batch
 
-    def _take(self, batch: "_Batch") -> None:
+    def _take(self, together: list[Asked], batch: Batch) -> None:
         """The outcomes of what was sent."""
-        try:
-            with self._or_close():
-                answers = [self._taken(i, batch) for i in range(len(batch.messages))]
-        except _Unknown:
-            self.number = 1
-            return self._play(batch.asked)
-        slices: list[list[Outcome]] = [[] for _ in batch.asked]
-        told = foreign.tally(batch.asked[0].part.env)  # pyright: ignore[reportArgumentType]
-        for share, (outcomes, endings) in zip(batch.shares, answers, strict=True):
-            told.add(endings)
-            for (i, _), outcome in zip(share, outcomes, strict=True):
-                slices[i].append(outcome)
-        told.check()
-        for asked, parts in zip(batch.asked, slices, strict=True):
+        with self._or_close():
+            answers = [self._taken(k, batch) for k in range(len(batch.shares))]
+        if unknown := [said for kind, said in answers if kind == "unknown"]:
+            self._dismiss(unknown[0])
+            return self._play(together)
+        slices: list[list[Outcome]] = [[] for _ in together]
+        tally = foreign.tally(batch.parts[0].env)  # pyright: ignore[reportArgumentType]
+        with self._or_close():
+            for share, answer in zip(batch.shares, answers, strict=True):
+                outcomes, endings = _heard(answer)
+                tally.add(endings)
+                for (i, _, _), outcome in zip(share, outcomes, strict=True):
+                    slices[i].append(outcome)
+            tally.check()
+        for asked, parts in zip(together, slices, strict=True):
             asked.outcome = joined(parts)
         return None
+
+    def _taken(self, k: int, batch: Batch) -> Answer:
+        """What came of share `k`, given out again whenever its process dies."""
+        assert self.crew is not None
+        for _ in range(self.crew.tries):
+            answer = self.crew.take(k)
+            if answer is not None:
+                return answer
+            self._suspects.add(batch.parts[0].env)
+            self.crew.give(batch, k, spared=True)
+        raise NotPlayed(
+            f"a process that plays episodes ended {self.crew.tries} times over the same ones: give "
+            "it more memory, or --processes 1 to see what happens"
+        )
+
+    def _dismiss(self, why: str) -> None:
+        """Play here from now on what the crew cannot have, of a class of the user's script, or one
+        that was made in a function. Raises `NotPlayed` if the crew was asked for."""
+        assert self.crew is not None
+        if self.crew.instead:
+            raise NotPlayed(f"{self.crew.instead}: {why}. Put what it names into a module")
+        self.close()
+        self.crew = None
 
     @contextlib.contextmanager
     def _or_close(self) -> Iterator[None]:
@@ -153,87 +181,11 @@ class Players:
             self.close()
             raise
 
-    def _begun(self, i: int) -> "_Player":
-        """Player `i`, begun if there is none."""
-        one = self._all[i]
-        if one is None or one.over(0.0):
-            one = self._all[i] = _Player()
-        return one
-
-    def _taken(self, i: int, batch: "_Batch") -> tuple[list[Outcome], list[str]]:
-        """What came of the share that player `i` was given, and how its episodes ended."""
-        for _ in range(TRIES):
-            one = self._all[i]
-            answer = one.take() if one is not None else None
-            if answer is not None:
-                return _heard(answer)
-            self._drop(i)
-            self._suspects.add(batch.asked[0].part.env)
-            self._begun(i).give(batch.messages[i], spared=True)
-        raise RuntimeError(
-            f"a process that plays episodes ended {TRIES} times over the same ones: give it more "
-            "memory, or --processes 1 to see what happens"
-        )
-
-    def _drop(self, i: int) -> None:
-        one, self._all[i] = self._all[i], None
-        if one is not None:
-            one.end(0.0)
-
     def close(self) -> None:
         """End all processes, and give up what they were playing."""
         self._away = None
-        for i in range(len(self._all)):
-            self._drop(i)
-
-
-@dataclasses.dataclass
-class _Batch:
-    """What was sent out together: a share and a message for each process."""
-
-    asked: list[Asked]
-    shares: list[Share]
-    messages: list[bytes]
-
-
-class _Unknown(Exception):
-    """A policy or task that another process cannot have: of a class of the user's script, or one
-    that was made in a function. It is played here, as well."""
-
-
-class _Player(Child):
-    """One process, and the pipes to it."""
-
-    def __init__(self):
-        pipe = subprocess.PIPE
-        super().__init__(
-            player.__name__, opening=True, stdin=pipe, stdout=pipe, env=worker.one_thread()
-        )
-        assert self.stdin is not None
-        assert self.stdout is not None
-        self._to, self._from = self.stdin, self.stdout
-
-    def give(self, message: bytes, spared: bool) -> None:
-        """A share to play; `spared`: the task must not end the process."""
-        with contextlib.suppress(BrokenPipeError):  # it is dead, and `take` hears of it
-            self._to.write(ASKED.pack(spared, len(message)))
-            self._to.write(message)
-            self._to.flush()
-
-    def take(self) -> Any:
-        """Its answer; None if it is dead."""
-        head = self._from.read(LENGTH.size)
-        if len(head) < LENGTH.size:
-            return None
-        (length,) = LENGTH.unpack(head)
-        body = self._from.read(length)
-        return pickle.loads(body) if len(body) == length else None
-
-    def end(self, grace: float) -> None:
-        for stream in (self._to, self._from):
-            with contextlib.suppress(OSError):
-                stream.close()
-        super().end(grace)
+        if self.crew is not None:
+            self.crew.close()
 
 
 def _sendable(env: AbstractHostEnvironment) -> bool:
@@ -241,49 +193,50 @@ def _sendable(env: AbstractHostEnvironment) -> bool:
     return isinstance(env, foreign.AbstractForeignEnvironment) and not env.here and not env.at_once
 
 
-def _told(env: AbstractHostEnvironment, share: Share) -> bytes:
-    """What a player is told: its slices of parts, and what it must know to open the task."""
-    plain = [
-        dataclasses.replace(part, population=jax.tree.map(_plain, part.population))
-        for _, part in share
-    ]
-    try:
-        told = foreign.told(env)  # pyright: ignore[reportArgumentType]
-        return pickle.dumps((plain, told), protocol=5)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise _Unknown(str(error)) from error
+def _plain(part: Part) -> Part:
+    """The same in arrays of NumPy."""
+    population = jax.tree.map(
+        lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, part.population
+    )
+    return dataclasses.replace(part, population=population)
 
 
-def _plain(x: Any) -> Any:
-    return np.asarray(x) if isinstance(x, jax.Array) else x
-
-
-def _heard(answer: tuple[str, Any]) -> Any:
+def _heard(answer: Answer) -> Any:
     """What a player says; what it raised is raised here."""
     kind, said = answer
     if kind == "outcome":
         return said
-    raise {"failure": EnvironmentFailure, "unknown": _Unknown}.get(kind, RuntimeError)(said)
+    raise {"failure": EnvironmentFailure}.get(kind, NotPlayed)(said)
 
 
 class _Current(threading.local):
     def __init__(self):
-        self.players = Players(1)
+        self.players = Players()
 
 
 _CURRENT = _Current()
 
 
 @contextlib.contextmanager
-def using(number: int | None) -> Iterator[None]:
+def using(number: int | None, on: str = "local") -> Iterator[None]:
     """In here this thread's rollouts are shared out among so many processes; None: one for each
-    core."""
-    before, _CURRENT.players = _CURRENT.players, Players(number or len(cores()))
-    try:
-        yield
-    finally:
-        _CURRENT.players.close()
-        _CURRENT.players = before
+    core. `on`: "local", "ray" or "ray:ADDRESS". Raises `ClusterLost` if no cluster answers."""
+    before = _CURRENT.players
+    with contextlib.ExitStack() as stack:
+        kind, _, address = on.partition(":")
+        if kind == "ray":
+            from .ray import crew  # it is not needed elsewhere
+
+            players = Players(stack.enter_context(crew(address, number)), patience=0.0)
+        else:
+            number = number or len(cores())
+            players = Players(Processes(number) if number > 1 else None)
+        _CURRENT.players = players
+        try:
+            yield
+        finally:
+            players.close()
+            _CURRENT.players = before
 
 
 def ask(part: Part) -> Asked:

@@ -28,6 +28,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from .. import compilation, rollout
 from ..compilation import jit
 from ..environments import processes
+from ..environments.cluster import ClusterLost
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
 from ..playing import players
 from ..replay import shapes_alone
@@ -366,9 +367,17 @@ def _train(
     """From `saved` to the end of the budget. The caller holds the lock."""
     training = _Training(run, algorithm, saved, options, heard)
     del saved  # its state is donated: the old one may not be held
-    sharing = players.using(options.processes)
-    with Signals(quiet=not options.progress) as signals, training.bar, sharing:
-        reason = training.go_on(signals)
+    if options.rollouts != "local" and not isinstance(algorithm.env, AbstractHostEnvironment):
+        raise RunError(f"--rollouts {options.rollouts} is for tasks outside JAX: leave it out")
+    try:
+        with (
+            players.using(options.processes, options.rollouts),
+            Signals(quiet=not options.progress) as signals,
+            training.bar,
+        ):
+            reason = training.go_on(signals)
+    except ClusterLost as error:
+        raise RunError(str(error)) from error
     if reason == "signal":
         where = training.budget.where(training.generation, training.frames)
         raise Interrupted(
@@ -437,6 +446,12 @@ class _Training:
         self.listeners.end(reason)
         return reason
 
+    @property
+    def stands(self) -> str:
+        """What an error leaves, and how to go on, in words."""
+        stands = f"The checkpoint of generation {self.safe} stands"
+        return f"{stands}; resume with {self.run.advice}"
+
     def reason(self) -> str:
         """Why training ended."""
         if self.listeners.error is not None:
@@ -493,12 +508,9 @@ class _Training:
             else:
                 played = play(*at, self.chunk, self.budget)
             self.state, self.best, rows = played
-        except EnvironmentFailure as failure:
+        except (EnvironmentFailure, ClusterLost, players.NotPlayed) as failure:
             # The state was donated: what is on disk is all there is.
-            raise RunError(
-                f"{str(failure).rstrip('.')}. The checkpoint of generation {self.safe} stands; "
-                f"resume with {self.run.advice}"
-            ) from failure
+            raise RunError(f"{str(failure).rstrip('.')}. {self.stands}") from failure
         self.generation, self.frames = rows[-1]["generation"], rows[-1]["frames"]
         return rows
 

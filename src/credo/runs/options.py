@@ -36,6 +36,11 @@ class RunOptions:
     """Processes that play episodes of tasks outside JAX at the same time, at least 1; None: one for
     each core, once this one has played for two seconds. Their number changes no number of a run."""
 
+    rollouts: str = "local"
+    """Where these processes are: local, on this machine; ray, tasks of Ray on this machine;
+    ray:ADDRESS, tasks of the Ray cluster at HOST:PORT, or with auto of the one that this machine
+    belongs to. It changes no number of a run."""
+
     checkpoint_every: float = 60.0
     """Seconds between two checkpoints, at least 0; 0: after every dispatch."""
 
@@ -69,6 +74,13 @@ class RunOptions:
             raise ValueError("stop_at is nan: give a champion score, or None to stop at none")
         for name in ("keep", "processes"):
             require.at_least(name, getattr(self, name), 1)
+        kind, colon, address = self.rollouts.partition(":")
+        known = kind == "ray" and bool(colon) == bool(address)
+        if not known and self.rollouts != "local":
+            raise ValueError(
+                f"rollouts is {self.rollouts!r}: episodes are played on local, ray, ray:auto or "
+                "ray:HOST:PORT"
+            )
         object.__setattr__(self, "callbacks", tuple(self.callbacks))
         object.__setattr__(self, "loggers", tuple(self.loggers))
         for name in self.loggers:
