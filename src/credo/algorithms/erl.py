@@ -163,7 +163,7 @@ class ERL(Hybrid):
         settings |= {"elite_fraction": 0.2, "sync_period": 1, "redistribute": Decomposed()}
         settings |= {"warmup_frames": 5_000, "horizon": Truncated(200)}
         if not overrides.get("learners", True):  # evolution alone: nobody to share with or to ask
-            settings |= {"share": None, "horizon": None}
+            settings |= {"share": None, "horizon": None, "redistribute": None}
         return cls(env, network or HYBRID_NETWORK, **evolving(BREEDER, settings, overrides))
 
     @classmethod
