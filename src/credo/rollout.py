@@ -23,7 +23,7 @@ from .environments.base import AbstractEnvironment, AbstractSequenceTask, correc
 from .environments.host import AbstractHostEnvironment, EnvironmentFailure, Episodes, sound
 from .environments.wrappers import Given
 from .networks.base import AbstractPolicy
-from .playing import acted, each, players, started, world_keys
+from .playing import acted, devices, each, players, started, world_keys
 from .types import Evaluation, Sequence, Trace, Transition, plain
 
 Environment = AbstractEnvironment | AbstractHostEnvironment
@@ -120,7 +120,7 @@ def collect(
     key,
 ) -> tuple[Evaluation, Experience]:
     """`evaluate`, and every transition that was met. Outside JAX a finished episode costs no more
-    physics; in JAX all lanes step until the last one ends.
+    physics; in JAX all lanes of a device step until the last one of them ends.
 
     **Arguments:** of its `episodes` each member plays the first `wanted`, None: all; that number is
     data. The others have no steps and a return of 0. Episodes are truncated after `limit` steps,
@@ -263,21 +263,24 @@ def _answer(
 ) -> Evaluation:
     """Sequences are known before anybody acts: they are drawn first and answered together."""
     if isinstance(env, Given):
-        return _answer_these(env, population, jax.tree.map(lambda x: x[None], env.sequences))
+        given = jax.tree.map(lambda x: x[None], env.sequences)
+        return _answer_these(env, (population, given))
     world_key, _ = jax.random.split(key)
     keys = world_keys(1 if common else tree.size(population), episodes, common, key=world_key)
     # An episode resets with the first half of its world key: the same sequences either way.
     sequences = each(lambda key: env.sample(key=jax.random.split(key)[0]))(keys)
-    return _answer_these(env, population, sequences)
+    return _answer_these(env, (population, sequences))
 
 
 @jit
+@devices.shared
 def _play_in_turn(env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: bool):
     """Large policies some at a time: their weights stay in the cache from step to step."""
     return tree.in_batches(lambda some: _play(env, some, wanted, record), lanes)
 
 
 @jit
+@devices.shared
 def _play(
     env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: bool, limit: Any = None
 ) -> tuple[Evaluation, Any]:
@@ -433,17 +436,18 @@ def _evaluated(came: playing.Outcome) -> Evaluation:
     return Evaluation(*jax.tree.map(jnp.asarray, (came.returns, came.steps)))
 
 
-def _answer_these(
-    task: AbstractSequenceTask, population: PyTree, sequences: Sequence
-) -> Evaluation:
+@devices.shared
+def _answer_these(task: AbstractSequenceTask, members: tuple[PyTree, Sequence]) -> Evaluation:
     """Answer labelled sequences with a population of features-first policies.
 
     The population is packed on the last axis and the sequences on the one before, so that every
     operation is one contiguous loop; the arithmetic is that of one policy.
     Memory does not grow with the sequences' length beyond the sequences themselves.
 
-    **Arguments:** `sequences` `[pop or 1, episodes]`; 1 gives all members the same ones.
+    **Arguments:** `members`: policies `[pop]` and sequences `[pop or 1, episodes]`; 1 gives all
+    the same ones.
     """
+    population, sequences = members
     pop = tree.size(population)
     packed = pack(population)
     # [pop or 1, episodes, time, ...] -> [time, ..., episodes, pop or 1]

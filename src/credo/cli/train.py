@@ -43,7 +43,7 @@ class Train:
     same run."""
     seeds: int = 1
     """Number of runs, at least 1, with --seed and the seeds after it. Several have a process each,
-    one per core at a time, unless --on names another place."""
+    one per core at a time, unless --on names another place or --devices a device for each."""
     path: pathlib.Path | None = None
     """Folder of the run, new or empty; of several runs the folder of theirs. None:
     runs/ALGORITHM-TASK-SEED."""

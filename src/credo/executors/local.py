@@ -1,5 +1,6 @@
 """Many runs, one process per core: on two cores, two single-threaded runs beat one that uses
-both. What is finished is not run again; what was stopped goes on.
+both. What is finished is not run again; what was stopped goes on. Runs on several devices are
+trained by this process (see `devices`).
 
 Workers get one job after another over a pipe (see `worker`). Each is a child as environments have
 them: whatever it started ends with it, after its last job, after an error, after a second Ctrl-C,
@@ -18,7 +19,7 @@ from typing import Any, NamedTuple
 from ..environments import processes
 from ..environments.processes import Child
 from ..runs.signals import Signals
-from . import worker
+from . import devices, worker
 from .board import Board
 from .jobs import Ending, Job
 from .places import Place
@@ -30,6 +31,8 @@ GRACE = 10.0  # seconds that a worker without a job has to end in
 def train(jobs: Sequence[Job], workers: int | None, place: Place, title: str) -> Ending:
     """Train jobs in processes of this machine, `workers` at a time; None: one per core that this
     process may use."""
+    if (number := max(job.options.devices or 1 for job in jobs)) > 1:
+        return devices.train(jobs, min(number, workers or number), title)
     crew = _Crew(jobs, title)
     number = crew.work(min(workers or len(processes.cores()), len(jobs)))
     return Ending(crew.failures, number)

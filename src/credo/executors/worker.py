@@ -42,7 +42,7 @@ def main() -> None:
             jax.clear_caches()  # programs of an earlier cell would pile up
             before = job["algorithm"]
         try:
-            _train_when_free(job)
+            train_when_free(job)
             answer = {"ok": job["path"]}
         except Interrupted as error:
             answer, stop = {"error": str(error)}, error.code
@@ -54,16 +54,16 @@ def main() -> None:
             raise SystemExit(stop)
 
 
-def _train_when_free(job: dict[str, Any]) -> None:
-    """Train once no other process has the run. Raises `RunLocked` if one still has it after the
-    job's `patience` in seconds."""
+def train_when_free(job: dict[str, Any], **changes: Any) -> None:
+    """Train once no other process has the run; `changes` are fields of its options. Raises
+    `RunLocked` if one still has it after the job's `patience` in seconds."""
     from ..runs.ending import say
     from ..runs.lock import RunLocked
 
     until, told = time.monotonic() + job["patience"], False
     while True:
         try:
-            return _train(job)
+            return _train(job, changes)
         except RunLocked as error:
             if time.monotonic() >= until:
                 raise
@@ -73,11 +73,12 @@ def _train_when_free(job: dict[str, Any]) -> None:
         time.sleep(POLL)
 
 
-def _train(job: dict[str, Any]) -> None:
+def _train(job: dict[str, Any], changes: dict[str, Any]) -> None:
     """Begin a run, or go on with the one in its folder."""
     from ..runs import config, loop, options, record
 
-    path, told = pathlib.Path(job["path"]), options.RunOptions.read(job["options"])
+    path = pathlib.Path(job["path"])
+    told = options.RunOptions.read(job["options"]).changed(changes)
     if (path / record.NAME).exists():
         # Its settings are those of the job: the parent looked (`Job.finished`).
         loop.resume(path, told, **job["again"])

@@ -30,7 +30,7 @@ from ..compilation import jit
 from ..environments import processes
 from ..environments.cluster import ClusterLost
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
-from ..playing import players
+from ..playing import devices, players
 from ..replay import shapes_alone
 from ..types import NOTHING
 from . import callbacks, checkpoint, config, files, log, record, screen, segments, weights
@@ -111,6 +111,7 @@ def train(
     compilation.enable_cache()
     if isinstance(seed, bool) or not (isinstance(seed, int) and 0 <= seed < 2**32):
         raise ValueError(f"seed is {seed}: it must be a whole number from 0 to 2^32 - 1")
+    devices.require(options.devices, algorithm.env)
     said = _said(algorithm, options, seed, warm_start)
     source = None if warm_start is None else Run(warm_start)
     path = pathlib.Path(path) if path else free_name(algorithm, seed)
@@ -156,6 +157,7 @@ def resume(
     compilation.enable_cache()
     with lock(Run(path, trust=trust).path):  # what is no run gets no lock
         run = Run(path, trust=trust)
+        devices.require(options.devices, run.algorithm.env)
         fit, saved = _reopened(run, options, dict(set or {}), without_replay)
         if run.config != record.read(run.path) or (trust and not signed_here(run.config)):
             record.write(run.path, run.config, sign=run.trusted)
@@ -372,6 +374,7 @@ def _train(
     try:
         with (
             players.using(options.processes, options.rollouts),
+            devices.using(options.devices),
             Signals(quiet=not options.progress) as signals,
             training.bar,
         ):
@@ -431,6 +434,7 @@ class _Training:
             self.bar.say(told)
             self.save()
             return "budget"
+        self.state, self.best = devices.everywhere((self.state, self.best))
         self.require_sound()
         self.bar.start([buffer for _, buffer in segments.buffers(self.state)])
         try:

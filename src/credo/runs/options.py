@@ -41,6 +41,11 @@ class RunOptions:
     ray:ADDRESS, tasks of the Ray cluster at HOST:PORT, or with auto of the one that this machine
     belongs to. It changes no number of a run."""
 
+    devices: int | None = None
+    """Devices of this machine that share out the episodes of tasks in JAX, by members of the
+    population, at least 1; of several runs each is trained on one of them. None: one. Their number
+    changes a run by rounding at most (docs, GPUs and several devices)."""
+
     checkpoint_every: float = 60.0
     """Seconds between two checkpoints, at least 0; 0: after every dispatch."""
 
@@ -72,7 +77,7 @@ class RunOptions:
             require.at_least(name, getattr(self, name), 0)
         if self.stop_at is not None and math.isnan(self.stop_at):
             raise ValueError("stop_at is nan: give a champion score, or None to stop at none")
-        for name in ("keep", "processes"):
+        for name in ("keep", "processes", "devices"):
             require.at_least(name, getattr(self, name), 1)
         kind, colon, address = self.rollouts.partition(":")
         known = kind == "ray" and bool(colon) == bool(address)
