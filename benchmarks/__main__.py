@@ -1,4 +1,4 @@
-"""Run every benchmark: `python -m benchmarks [NAME …]`, one core each.
+"""Run every benchmark: `python -m benchmarks [NAME …]`, one core each unless it says otherwise.
 
 Compare ratios of one run; seconds depend on the machine and on who else uses it.
 """
@@ -16,6 +16,9 @@ NAMES = (
     "maddpg_update",
     "first_output",
     "replay_memory",
+    "rollouts",
+    "overlap",
+    "workers",
 )
 
 if __name__ == "__main__":

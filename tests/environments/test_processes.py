@@ -264,3 +264,30 @@ def test_processes_settle_on_different_cores_whoever_started_them():
         for process, _ in running:
             process.kill()
             process.communicate()
+
+
+SETTLED = """
+import os, subprocess, sys, threading
+from credo.environments import processes
+processes.CLAIM = sys.argv[1]
+before, stay = processes.cores(), threading.Event()
+thread = threading.Thread(target=stay.wait)
+thread.start()
+child = [sys.executable, "-c", "import os; print(sorted(os.sched_getaffinity(0)))"]
+with processes.settled():
+    assert len(processes.cores()) == 1
+    assert os.sched_getaffinity(thread.native_id) == set(processes.cores())
+    assert processes.others() == len(before) - 1
+    with processes._roaming():
+        assert eval(subprocess.check_output(child)) == before
+    assert len(processes.cores()) == 1
+assert processes.cores() == sorted(os.sched_getaffinity(thread.native_id)) == before
+assert processes.others() == 0 and not processes._claims
+stay.set()
+"""
+
+
+@pytest.mark.skipif(not processes.LINUX, reason="no process is bound to a core")
+@pytest.mark.skipif(len(processes.cores()) < 2, reason="there is one core")
+def test_a_settled_process_has_one_core_and_its_children_all():
+    subprocess.run([sys.executable, "-c", SETTLED, f"settled-{os.getpid()}"], check=True)

@@ -19,7 +19,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 LINUX = sys.platform == "linux"
@@ -30,6 +30,7 @@ MOST_ON_A_CORE = 64  # processes that settle there; one more may run on any
 MULTIPLYING = "put it under if __name__ == '__main__'"
 
 _claims: list[socket.socket] = []  # on the cores that this process has settled on
+_roam: set[int] | None = None  # where children may run while this process is `settled`
 _worker = False  # whether this process is a child, started here
 _opening = True  # whether code that is imported here may start children
 _forked = False  # whether it was forked from one in which JAX has threads
@@ -75,6 +76,53 @@ def settle() -> int | None:
             os.sched_setaffinity(0, {core})
             return core
     return None
+
+
+@contextlib.contextmanager
+def settled() -> Iterator[None]:
+    """In here all threads of this process compute on one core (see `settle`), and its children on
+    any."""
+    global _roam
+    before, own = set(cores()), len(_claims)
+    if len(before) == 1 or settle() is None:
+        yield
+        return
+    _bind(set(cores()))
+    _roam = before
+    try:
+        yield
+    finally:
+        _roam = None
+        _bind(before)
+        for claim in _claims[own:]:
+            claim.close()
+        del _claims[own:]
+
+
+def others() -> int:
+    """How many cores children may have beside the one on which this process is `settled`."""
+    return 0 if _roam is None else len(_roam) - 1
+
+
+def _bind(where: set[int]) -> None:
+    """Run all threads of this process on some cores."""
+    for thread in map(int, os.listdir("/proc/self/task")):
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            os.sched_setaffinity(thread, where)
+
+
+@contextlib.contextmanager
+def _roaming() -> Iterator[None]:
+    """In here this thread may run where children may, who are born with what it may."""
+    if _roam is None:
+        yield
+        return
+    own = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, _roam)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, own)
 
 
 def allow(doing: str = "starts training", *, opening: bool = False) -> None:
@@ -132,7 +180,8 @@ class Child(subprocess.Popen):
         path = json.dumps([os.path.abspath(entry) for entry in sys.path])
         told = [module, path, str(grace), str(self._owner), str(int(opening)), *arguments]
         options = {"stdin": subprocess.DEVNULL, "start_new_session": True} | options
-        super().__init__([sys.executable, "-P", os.path.abspath(__file__), *told], **options)
+        with _roaming():
+            super().__init__([sys.executable, "-P", os.path.abspath(__file__), *told], **options)
         self._grace = grace
         self.ending = _pidfd(self.pid)
         """Readable once the child has ended; None where there is no such thing."""

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..environments import foreign
 from ..environments.host import AbstractHostEnvironment, EnvironmentFailure
-from ..environments.processes import cores
+from ..environments.processes import cores, others
 from . import Outcome, Part, joined, play, shared
 from .crew import AbstractCrew, Answer, Batch
 from .local import Processes
@@ -220,7 +220,8 @@ _CURRENT = _Current()
 @contextlib.contextmanager
 def using(number: int | None, on: str = "local") -> Iterator[None]:
     """In here this thread's rollouts are shared out among so many processes; None: one for each
-    core. `on`: "local", "ray" or "ray:ADDRESS". Raises `ClusterLost` if no cluster answers."""
+    core, but for that on which this process is `settled`. `on`: "local", "ray" or "ray:ADDRESS".
+    Raises `ClusterLost` if no cluster answers."""
     before = _CURRENT.players
     with contextlib.ExitStack() as stack:
         kind, _, address = on.partition(":")
@@ -228,6 +229,8 @@ def using(number: int | None, on: str = "local") -> Iterator[None]:
             from .ray import crew  # it is not needed elsewhere
 
             players = Players(stack.enter_context(crew(address, number)), patience=0.0)
+        elif number is None and others():
+            players = Players(Processes(others()))
         else:
             number = number or len(cores())
             players = Players(Processes(number) if number > 1 else None)

@@ -11,6 +11,7 @@ A run is a folder:
     best.safetensors     the champion with the highest test score so far
 """
 
+import contextlib
 import dataclasses
 import json
 import pathlib
@@ -112,10 +113,12 @@ def train(
     if isinstance(seed, bool) or not (isinstance(seed, int) and 0 <= seed < 2**32):
         raise ValueError(f"seed is {seed}: it must be a whole number from 0 to 2^32 - 1")
     devices.require(options.devices, algorithm.env)
-    said = _said(algorithm, options, seed, warm_start)
-    source = None if warm_start is None else Run(warm_start)
     path = pathlib.Path(path) if path else free_name(algorithm, seed)
-    with new_folder(path):
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_beside(algorithm, options))
+        said = _said(algorithm, options, seed, warm_start)
+        source = None if warm_start is None else Run(warm_start)
+        stack.enter_context(new_folder(path))
         fit = fitted(algorithm, Budget(**said["budget"]))
         _begin(path, said, fit, source)
         run = Run(path, trust=True)
@@ -157,12 +160,23 @@ def resume(
     compilation.enable_cache()
     with lock(Run(path, trust=trust).path):  # what is no run gets no lock
         run = Run(path, trust=trust)
-        devices.require(options.devices, run.algorithm.env)
-        fit, saved = _reopened(run, options, dict(set or {}), without_replay)
-        if run.config != record.read(run.path) or (trust and not signed_here(run.config)):
-            record.write(run.path, run.config, sign=run.trusted)
-        _warn_of_other_machine(run.config["machine"])
-        return _train(run, fit, saved, options, heard)
+        recorded = run.algorithm
+        devices.require(options.devices, recorded.env)
+        with _beside(recorded, options):
+            fit, saved = _reopened(run, options, dict(set or {}), without_replay)
+            if run.config != record.read(run.path) or (trust and not signed_here(run.config)):
+                record.write(run.path, run.config, sign=run.trusted)
+            _warn_of_other_machine(run.config["machine"])
+            return _train(run, fit, saved, options, heard)
+
+
+def _beside(algorithm: Any, options: RunOptions) -> contextlib.AbstractContextManager[None]:
+    """On one core, where learners learn while other processes play: neither waits for the other.
+    It is best entered before JAX counts its threads."""
+    outside = isinstance(algorithm.env, AbstractHostEnvironment)
+    if getattr(algorithm, "overlap", False) and outside and options.processes is None:
+        return processes.settled()
+    return contextlib.nullcontext()
 
 
 # How a run begins.
