@@ -14,6 +14,8 @@ import pathlib
 import subprocess
 import sys
 import tempfile
+import time
+from typing import Any
 
 import numpy as np
 
@@ -57,9 +59,8 @@ def ours(cores: list[int], path: pathlib.Path) -> float:
     return (last - first) * (EPISODES + TESTS) * STEPS / (ended - began) / len(cores)
 
 
-def taken(path: pathlib.Path) -> np.ndarray:
-    """The actions of every member of a run's last generation, in an episode with its number as the
-    seed: `[members, steps, actions]`."""
+def parts(path: pathlib.Path, record: bool) -> list[Any]:
+    """An episode of every member of a run's last generation, with its number as the seed."""
     import jax
 
     from credo import Run, playing
@@ -67,13 +68,72 @@ def taken(path: pathlib.Path) -> np.ndarray:
 
     run = Run(path)
     algorithm = run.algorithm
-    population = loop._load(run, algorithm).state.population
+    population = jax.tree.map(np.asarray, loop._load(run, algorithm).state.population)
     worlds = np.arange(EPISODES, dtype=np.uint32)[:, None]
     keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), worlds.shape)))
-    part = playing.Part(algorithm.env, population, worlds, keys, 1, record=True)
-    (outcome,) = playing.play([part])
-    assert outcome.rows is not None
-    return outcome.rows[1].reshape(EPISODES, STEPS, -1)
+    return [playing.Part(algorithm.env, population, worlds, keys, 1, record)]
+
+
+def taken(path: pathlib.Path) -> np.ndarray:
+    """What they do: `[members, steps, actions]`."""
+    from credo import playing
+
+    rows = playing.play(parts(path, record=True))[0].rows
+    assert rows is not None
+    return rows[1].reshape(EPISODES, STEPS, -1)
+
+
+def walk(path: pathlib.Path, actions: np.ndarray) -> None:
+    """Say what one step of one member costs a process that plays all of them, layer upon layer."""
+    import gymnasium
+
+    from credo import playing
+    from credo.environments import foreign, worker
+    from credo.environments.host import Episodes
+    from credo.playing import crew
+
+    crew.enlist()
+    foreign.spare(True)
+    given, every = parts(path, record=False), np.ones(EPISODES, bool)
+    env, seeds = given[0].env, given[0].worlds[:, 0]
+    sweeps = np.ascontiguousarray(actions.swapaxes(0, 1))
+    alone = gymnasium.make("Swimmer-v5")
+    held, copies = worker.Environments(env.spec(), EPISODES), env.copies(EPISODES)
+
+    def physics():
+        for seed in range(EPISODES):
+            alone.reset(seed=seed)
+            for action in actions[seed]:
+                alone.step(action)
+
+    def stepped(many):
+        many.reset(seeds, every)
+        for sweep in sweeps:
+            many.step(sweep, every)
+
+    def episodes():
+        told = Episodes(env, EPISODES, record=False)
+        told.begin(seeds, every)
+        for sweep in sweeps:
+            told.advance(sweep)
+
+    layers = {
+        "MuJoCo and Gymnasium": physics,
+        "actions in, observations out": lambda: stepped(held),
+        "what fails is named": lambda: stepped(copies),
+        "episodes and their returns": episodes,
+        "networks": lambda: playing.play(given),
+    }
+    below = 0.0
+    for name, layer in layers.items():
+        seconds = []
+        for _ in range(3):
+            began = time.perf_counter()
+            layer()
+            seconds.append(time.perf_counter() - began)
+        cost = min(seconds) / actions.shape[0] / actions.shape[1] * 1e6
+        print(f"  {name:30s} {cost - below:5.1f} us, together {cost:.1f}")
+        below = cost
 
 
 def main() -> None:
@@ -88,6 +148,10 @@ def main() -> None:
                 rates.append(ours(cores, path))
                 np.save(actions, taken(path))
                 raws.append(physics(cores, actions))
+            print(f"one step of one of {EPISODES} members, in one process that plays", flush=True)
+            program = "from benchmarks.rollouts import *; walk(pathlib.Path(sys.argv[1]), "
+            program += "np.load(sys.argv[2]))"
+            subprocess.run([sys.executable, "-c", program, str(path), str(actions)], check=True)
         finally:
             os.sched_setaffinity(0, pinned)
     rate, raw = np.mean(rates), np.mean(raws)

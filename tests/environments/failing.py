@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -82,3 +83,14 @@ class Picture(Tiny):
 
     def _answer(self, where, action):
         return np.full((2, 2), 200 + int(where == "step"), np.uint8)
+
+
+class Alarming(Tiny):
+    """Has a limit of time of its own, as graders have."""
+
+    def step(self, action):
+        signal.alarm(5)
+        try:
+            return super().step(action)
+        finally:
+            signal.alarm(0)

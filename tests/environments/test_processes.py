@@ -270,20 +270,27 @@ SETTLED = """
 import os, subprocess, sys, threading
 from credo.environments import processes
 processes.CLAIM = sys.argv[1]
-before, stay = processes.cores(), threading.Event()
-thread = threading.Thread(target=stay.wait)
-thread.start()
+before = processes.cores()
 child = [sys.executable, "-c", "import os; print(sorted(os.sched_getaffinity(0)))"]
 with processes.settled():
     assert len(processes.cores()) == 1
-    assert os.sched_getaffinity(thread.native_id) == set(processes.cores())
+    stay = threading.Event()
+    thread = threading.Thread(target=stay.wait)
+    thread.start()
     assert processes.others() == len(before) - 1
-    with processes._roaming():
+    with processes.roaming():
         assert eval(subprocess.check_output(child)) == before
     assert len(processes.cores()) == 1
 assert processes.cores() == sorted(os.sched_getaffinity(thread.native_id)) == before
 assert processes.others() == 0 and not processes._claims
 stay.set()
+assert processes.counted() == len(before)
+import jax
+with processes.settled():  # and JAX begins
+    assert jax.numpy.ones(2).sum() == 2
+assert processes.counted() == 1
+with processes.settled():  # its threads are counted
+    assert processes.cores() == before
 """
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from credo import playing, rollout
-from credo.environments import foreign, processes
+from credo.environments import foreign, processes, worker
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.host import EnvironmentFailure
 from credo.environments.pettingzoo import PettingZoo
@@ -197,16 +197,47 @@ def test_a_task_that_ends_its_process_costs_the_episode_alone(fault):
     # One episode in nine ends the process that plays them, and with it all others there.
     kwargs = {"every": 9, "fault": fault, "at": 2}
     task = Gymnasium("failing:Rare", kwargs=kwargs, max_episode_steps=6, tolerated=1.0, timeout=1.0)
+    seeds = np.asarray(playing.draw((7, 4), False, jax.random.key(1))[0])
+    alone = played(task, MLP(hidden=(4,)), 7, 4, common=False)
+    assert np.isnan(alone[0].of("reward")).tolist() == (seeds % 9 == 0).tolist()
+    assert (seeds % 9 == 0).any()
     crew = hasty(2)
     try:
-        returns = played(task, MLP(hidden=(4,)), 4, common=False, crew=crew)[0].of("reward")
+        for _ in range(2):  # at first without a worker, then with one
+            assert same(alone, played(task, MLP(hidden=(4,)), 7, 4, common=False, crew=crew))
+            assert crew._suspects == {task}
+    finally:
+        crew.close()
+
+
+def test_copies_without_a_worker_are_closed_where_they_may_end_nobody():
+    foreign.spare(True)
+    try:
+        TASK.copies(2).reset(np.zeros(2, np.uint32), np.ones(2, bool))
+        assert isinstance(TASK.copies(2)._backend, worker.Fatal)
+        foreign.spare(False)
+        TASK.copies(2).reset(np.zeros(2, np.uint32), np.ones(2, bool))
+        assert isinstance(TASK.copies(2)._backend, worker.Process)
+    finally:
+        foreign.spare(False)
+        foreign.close(TASK)
+
+
+@pytest.mark.parametrize("timeout", [1e-9, 1e12, float("inf")])
+def test_any_time_can_be_waited(timeout):
+    some = worker.Fatal(TASK.spec(), 1, timeout)
+    try:
+        assert some.reset(np.zeros(1, np.uint32), np.ones(1, bool)).obs.shape == (1, 3)
+    finally:
+        some.close()
+
+
+def test_a_task_with_an_alarm_of_its_own_gets_a_worker():
+    task = Gymnasium("failing:Alarming", max_episode_steps=4, timeout=30.0)
+    crew = hasty(2)
+    try:
+        assert np.isfinite(played(task, MLP(hidden=(4,)), crew=crew)[0].of("reward")).all()
         assert crew._suspects == {task}
-        assert np.isnan(returns).any()
-        again = played(task, MLP(hidden=(4,)), 4, common=False, crew=crew)[0].of("reward")
-        assert np.isnan(again).any()
-        assert all(
-            one is not None and not one.over(0.0) for one in crew.crew.all
-        )  # they have a worker
     finally:
         crew.close()
 

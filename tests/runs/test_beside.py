@@ -109,9 +109,9 @@ def test_a_dispatch_that_goes_on_is_reported(tmp_path, monkeypatch, together):
     told = list[int]()
     report = loop._Training.report
 
-    def reported(self, rows):
+    def reported(self, rows, now):
         told.append(len(rows))
-        return report(self, rows)
+        return report(self, rows, now)
 
     monkeypatch.setattr(loop._Training, "report", reported)
     run = trained(EA, tmp_path / "run", generations=5)

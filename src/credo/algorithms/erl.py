@@ -121,7 +121,8 @@ class ERL(Hybrid):
     far; the champion keeps them."""
     overlap: bool = eqx.field(static=True, default=False)
     """Learners learn from what was played up to the generation before, while this one is played;
-    of tasks outside JAX at the same time, in other processes. False: after it, from all of it."""
+    of tasks outside JAX at the same time, in other processes. It is another algorithm, and faster
+    where both take long. False: after it, from all of it."""
 
     def __check_init__(self):
         require.at_least("sync_period", self.sync_period, 1)

@@ -9,6 +9,7 @@ import signal
 import socket
 import sys
 import time
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -43,10 +44,10 @@ def connected(ray: Any, address: str, flag: str, room: float = 0, store: int = S
         yield False
         return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    address = address or os.environ.get("RAY_ADDRESS", "local")
+    address = address or os.environ.get("RAY_ADDRESS") or "local"
     how: dict[str, Any] = {"address": address, "logging_level": "WARNING"}
     if address == "local":
-        cores = max(len(processes.cores()), math.ceil(room))
+        cores = max(processes.others() or len(processes.cores()), math.ceil(room))
         how |= {"num_cpus": cores, "include_dashboard": False, "object_store_memory": store}
         how |= {"logging_level": "ERROR"}  # nobody can reach it whom it might warn of
     before = signal.getsignal(signal.SIGTERM)
@@ -54,7 +55,9 @@ def connected(ray: Any, address: str, flag: str, room: float = 0, store: int = S
         try:
             if address not in ("local", "auto"):
                 _reach(address, 5.0)  # Ray itself would try for minutes
-            ray.init(**how)
+            with processes.roaming(), warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "os.fork")  # Ray's fork becomes another program
+                ray.init(**how)
         except (OSError, ValueError) as error:
             raise ClusterLost(
                 f"no Ray cluster answers at {address}: {error}. Start one (ray start --head), or "
@@ -73,7 +76,8 @@ class Head:
 
     def __init__(self, ray: Any):
         self.address = ray.get_runtime_context().gcs_address
-        self.answered = self.asked = time.monotonic()
+        self.asked = time.monotonic()
+        self.failing: float | None = None  # since when
         node = getattr(ray._private.worker, "_global_node", None)
         self._store = getattr(node, "plasma_store_socket_name", None)
 
@@ -96,9 +100,10 @@ class Head:
         self.asked = now
         try:
             _reach(self.address, 1.0)
-            self.answered = now
+            self.failing = None
         except OSError as error:
-            if now - self.answered > HEAD:
+            self.failing = self.failing or now
+            if now - self.failing > HEAD:
                 return (
                     f"the head of the Ray cluster at {self.address} has not answered for "
                     f"{HEAD:.0f} s ({error})"

@@ -237,9 +237,13 @@ def judged_elsewhere() -> None:
 
 
 def spare(may_be_lost: bool) -> None:
-    """Whether tasks that are opened in this thread from now on need no worker: what ends their
-    process, or hangs in it, then ends this one, and whoever asked for episodes asks again."""
+    """Whether tasks need no worker in this thread: what ends their process, or hangs in it, then
+    ends this one, and whoever asked for episodes asks again. If not, those without one are closed.
+    """
     _OPEN.spare = may_be_lost
+    if not may_be_lost:
+        for key in [key for key, kept in _OPEN.copies.items() if kept.fatal]:
+            _OPEN.copies.pop(key).close()
 
 
 class ForeignCopies(AbstractCopies):
@@ -247,7 +251,8 @@ class ForeignCopies(AbstractCopies):
 
     An episode in which the environment raises, hangs, ends its process or returns what it must not
     has failed, and its copy is opened anew. If the worker is lost, so are the episodes of all its
-    copies. `tolerated` of the task says when that is too much.
+    copies, which can be played again (`spoiled`). `tolerated` of the task says when that is too
+    much.
     """
 
     def __init__(self, env: AbstractForeignEnvironment, n: int):
@@ -295,6 +300,11 @@ class ForeignCopies(AbstractCopies):
         return not self._closed and (self._backend is None or self._backend.usable)
 
     @property
+    def fatal(self) -> bool:
+        """Whether this process would be lost with them."""
+        return isinstance(self._backend, worker.Fatal)
+
+    @property
     def failures(self) -> int:
         """How many of the last 100 episodes of this task have failed."""
         return self._tally.failures
@@ -336,7 +346,7 @@ class ForeignCopies(AbstractCopies):
             raise EnvironmentFailure(
                 f"{self._env.id}: these copies are closed: ask for copies(n) again"
             )
-        failed = active & self._stranded if self._hurt else None
+        failed, self.spoiled = active & self._stranded if self._hurt else None, None
         while True:
             backend = self._opened()
             asked, frame, faults = active if failed is None else active & ~failed, None, {}
@@ -354,6 +364,7 @@ class ForeignCopies(AbstractCopies):
             if frame is not None:
                 break
             gone = self._lost(name, asked, backend)
+            self.spoiled = gone & (np.arange(self.n) != backend.current[0])
             failed = gone if failed is None else failed | gone
         if failed is None and not faults:
             return frame, frame.failed

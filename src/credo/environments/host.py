@@ -67,6 +67,9 @@ class AbstractCopies(abc.ABC):
     n: int
     failed: Bool[np.ndarray, " n"] | None = None
     """Which active copies the last `reset` found broken: they have no episode. None: none."""
+    spoiled: Bool[np.ndarray, " n"] | None = None
+    """Whose episode the last `step` lost through no fault of its own, with the process of all: it
+    can be played again. None: nobody's."""
 
     @abc.abstractmethod
     def reset(self, seeds: UInt32[np.ndarray, " n"], active: Bool[np.ndarray, " n"]) -> np.ndarray:
@@ -114,6 +117,8 @@ class InTurn(AbstractCopies):
             raise ValueError("a step was asked of a copy that is not playing: reset it first")
         now = self.inner.step(self._some(actions), self._some(active))
         now = HostStep(**jax.tree.map(self._all, vars(now)))
+        spoiled = self.inner.spoiled
+        self.spoiled = None if spoiled is None else self._all(spoiled)
         self._keep(now.failed)
         return now
 
@@ -188,7 +193,8 @@ class Episodes:
     `advance` while it is `ongoing`. Those that last longer than their `limit` are cut short.
 
     An episode is lost, with a return of NaN and no transitions, if it failed or if its policy said
-    NaN or inf. `active`: whose episode is under way.
+    NaN or inf. `active`: whose episode is under way. `again`: after a turn, whose episode was lost
+    with another's, and is to be played in a turn of its own.
     """
 
     def __init__(
@@ -205,7 +211,7 @@ class Episodes:
         self._env, self._copies = env, env.copies(n)
         self._record = np.broadcast_to(record, n)
         self._records = bool(self._record.any())
-        self._lost = np.zeros(n, bool)
+        self._lost, self.again = np.zeros((2, n), bool)
         self._sums = {name: np.zeros((n, *shape)) for name, shape in env.reward_shapes.items()}
         self._turns: list[tuple[np.ndarray, tuple[Any, ...]]] = []
 
@@ -215,6 +221,7 @@ class Episodes:
         if self._env.agents is not None:
             self._acting = np.ones((turn.size, self._env.agents), bool)
         self._obs = self._copies.reset(seeds, turn)
+        self.again = np.zeros(turn.size, bool)
         self.active = self._less(turn, self._copies.failed)
         self._rows, self._valid, self._done = [], [], 0
         self.ongoing = True
@@ -241,12 +248,19 @@ class Episodes:
             ends = (now.ended, over, self._acting)
             self._rows.append((self._obs, actions, now.rewards, now.obs, *ends))
             self._valid.append(active & self._record)
+        if now.failed is not None and self._copies.spoiled is not None:
+            self.again |= active & self._copies.spoiled
         active = self._less(active, now.failed)
         self.active = active & ~(now.terminated | over)
         self._obs, self._acting = now.obs, now.active
         self.ongoing = bool(self._done < self._most and self.active.any())
         if self._records and not self.ongoing:
             self._turns.append(self._kept())
+        if not self.ongoing and self.again.any():
+            self._lost &= ~self.again
+            self.steps[self.again] = 0
+            for total in self._sums.values():
+                total[self.again] = 0.0
         return self._obs
 
     def _less(self, active: np.ndarray, failed: np.ndarray | None) -> np.ndarray:

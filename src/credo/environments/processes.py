@@ -31,6 +31,7 @@ MULTIPLYING = "put it under if __name__ == '__main__'"
 
 _claims: list[socket.socket] = []  # on the cores that this process has settled on
 _roam: set[int] | None = None  # where children may run while this process is `settled`
+_counted = 0  # cores that JAX has counted, where it did while this process was `settled`
 _worker = False  # whether this process is a child, started here
 _opening = True  # whether code that is imported here may start children
 _forked = False  # whether it was forked from one in which JAX has threads
@@ -80,20 +81,21 @@ def settle() -> int | None:
 
 @contextlib.contextmanager
 def settled() -> Iterator[None]:
-    """In here all threads of this process compute on one core (see `settle`), and its children on
-    any."""
-    global _roam
+    """In here this process computes on one core (see `settle`), and its children on any. Not if JAX
+    has counted its threads already: more than one on a core would wait for each other."""
+    global _roam, _counted
     before, own = set(cores()), len(_claims)
-    if len(before) == 1 or settle() is None:
+    if len(before) == 1 or _jax_began() or settle() is None:
         yield
         return
-    _bind(set(cores()))
     _roam = before
     try:
         yield
     finally:
-        _roam = None
-        _bind(before)
+        _roam, _counted = None, int(_jax_began())
+        for thread in map(int, os.listdir("/proc/self/task")):
+            with contextlib.suppress(OSError):  # it has ended meanwhile
+                os.sched_setaffinity(thread, before)
         for claim in _claims[own:]:
             claim.close()
         del _claims[own:]
@@ -104,15 +106,14 @@ def others() -> int:
     return 0 if _roam is None else len(_roam) - 1
 
 
-def _bind(where: set[int]) -> None:
-    """Run all threads of this process on some cores."""
-    for thread in map(int, os.listdir("/proc/self/task")):
-        with contextlib.suppress(OSError):  # it has ended meanwhile
-            os.sched_setaffinity(thread, where)
+def counted() -> int:
+    """How many cores JAX computes on, by which it divides sums: those of this process, or one if it
+    was `settled` when JAX began."""
+    return _counted or len(cores())
 
 
 @contextlib.contextmanager
-def _roaming() -> Iterator[None]:
+def roaming() -> Iterator[None]:
     """In here this thread may run where children may, who are born with what it may."""
     if _roam is None:
         yield
@@ -147,8 +148,12 @@ def allow(doing: str = "starts training", *, opening: bool = False) -> None:
 def _after_fork() -> None:
     """Note in a fork whether JAX had been used, whose threads do not come along."""
     global _forked
-    bridge = sys.modules.get("jax._src.xla_bridge")
-    _forked = bool(getattr(bridge, "_backends", None))
+    _forked = _jax_began()
+
+
+def _jax_began() -> bool:
+    """Whether JAX has begun to compute, and has its threads."""
+    return bool(getattr(sys.modules.get("jax._src.xla_bridge"), "_backends", None))
 
 
 if hasattr(os, "register_at_fork"):
@@ -180,7 +185,7 @@ class Child(subprocess.Popen):
         path = json.dumps([os.path.abspath(entry) for entry in sys.path])
         told = [module, path, str(grace), str(self._owner), str(int(opening)), *arguments]
         options = {"stdin": subprocess.DEVNULL, "start_new_session": True} | options
-        with _roaming():
+        with roaming():
             super().__init__([sys.executable, "-P", os.path.abspath(__file__), *told], **options)
         self._grace = grace
         self.ending = _pidfd(self.pid)

@@ -44,6 +44,7 @@ SIZES = (
     "warnings",
 )
 GRACE = 2.0  # seconds that environments get to close themselves
+FOREVER = 1e9  # seconds: what a timer of the system can hold
 OPENING = 600.0  # seconds that opening one environment may take, if `timeout` is not longer
 LARGEST = float(np.finfo(np.float32).max)
 LOOK = "look at its id and kwargs, and whether its package is installed"
@@ -241,10 +242,10 @@ class Environments:
 class Fatal(Environments):
     """The same, in a process that others can spare: where no worker stands between, an environment
     that ends its process ends this one, and if a call takes longer than `timeout` seconds for all
-    copies together, SIGALRM does. A step costs a fifth less than in a worker."""
+    copies together, SIGALRM does. Nor does one stay that uses this signal itself."""
 
     def __init__(self, spec: dict[str, Any], n: int, timeout: float):
-        self._timeout = timeout
+        self._timeout, self._watched = timeout, False
         self._within(n * max(OPENING, timeout), super().__init__, spec, n, [0, 0])
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> Frame:
@@ -255,13 +256,22 @@ class Fatal(Environments):
     def step(self, actions: np.ndarray, active: np.ndarray) -> Frame:
         return self._within(self._timeout, super().step, actions, active)
 
-    @staticmethod
-    def _within(seconds: float, call: Callable[..., Any], *arguments: Any) -> Any:
-        signal.setitimer(signal.ITIMER_REAL, seconds)  # the system's own timer: no thread is needed
+    def close(self, grace: float = 0.0) -> None:
+        self._within(max(grace, GRACE), super().close, grace)
+
+    def _within(self, seconds: float, call: Callable[..., Any], *arguments: Any) -> Any:
+        """What a call returns, by the system's own timer, for which no thread is needed."""
+        if self._watched:  # within another call
+            return call(*arguments)
+        self._watched = True
+        signal.setitimer(signal.ITIMER_REAL, min(max(seconds, 1e-3), FOREVER))
         try:
             return call(*arguments)
         finally:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            self._watched = False
+            left, _ = signal.setitimer(signal.ITIMER_REAL, 0.0)
+            if left == 0.0 or signal.getsignal(signal.SIGALRM) is not signal.SIG_DFL:
+                os.kill(os.getpid(), signal.SIGKILL)  # the next hang would be noticed by nobody
 
 
 def _large(said: Any) -> bool:

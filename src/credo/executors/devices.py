@@ -16,6 +16,7 @@ import jax
 
 from ..playing.devices import require
 from ..runs.signals import Signals
+from ..runs.store import Run
 from . import worker
 from .board import Board
 from .jobs import Ending, Job
@@ -27,7 +28,7 @@ def train(jobs: Sequence[Job], number: int, title: str) -> Ending:
     **Raises:** `ValueError` if JAX has not so many, or a task is not played on them.
     """
     for job in jobs:
-        require(number, getattr(job.algorithm, "env", None))
+        require(number, _task(job))
     free = SimpleQueue[Any]()  # devices
     for device in jax.local_devices()[:number]:
         free.put(device)
@@ -35,6 +36,14 @@ def train(jobs: Sequence[Job], number: int, title: str) -> Ending:
     with Signals(quiet=False) as signals, ThreadPoolExecutor(number) as pool:
         tries = {pool.submit(_train, job, free, signals): job for job in jobs}
         return Ending(_failures(tries, signals, Board(title, len(jobs))), signals.received)
+
+
+def _task(job: Job) -> Any:
+    """What a run is trained on, as an object."""
+    made = job.algorithm
+    if isinstance(made, dict):  # as it was recorded
+        made = Run(job.path, trust=bool((job.again or {}).get("trust"))).algorithm
+    return made.env
 
 
 def _failures(

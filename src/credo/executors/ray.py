@@ -42,7 +42,9 @@ def train(jobs: Sequence[Job], workers: int | None, place: Place, title: str) ->
     """
     needs = {"num_cpus": 1, "max_retries": TRIES} | place.ray
     if any(job.options.rollouts != "local" for job in jobs):
-        raise RunError("--on ray trains each run in one task: leave --rollouts out")
+        raise ValueError(
+            "rollouts cannot be on ray too: a task of Ray trains each run, and plays it"
+        )
     try:
         ray, room = cluster.library("--on ray"), (workers or 0) * needs["num_cpus"]
         with cluster.connected(ray, place.address, "--on", room) as alone, _marks(jobs) as marks:

@@ -80,13 +80,16 @@ def play(parts: Sequence[Part]) -> list[Outcome]:
     limits = [env.max_steps if part.limit is None else part.limit for part in parts]
     told = Episodes(env, sum(sizes), record, np.repeat(limits, sizes))
     wanted = [np.tile(np.arange(p.worlds.shape[1]) < p.wanted, len(p.worlds)) for p in parts]
-    for turn in env.turns(np.concatenate(wanted)):
+    turns = env.turns(np.concatenate(wanted))
+    for turn in turns:  # more are added below
         obs = told.begin(np.concatenate([part.worlds.reshape(-1) for part in parts]), turn)
         for group in groups:
             group.begin()
         while told.ongoing:
             actions = [group.act(obs, told.active) for group in groups]
             obs = told.advance(np.concatenate(actions) if len(groups) > 1 else np.asarray(*actions))
+        if told.again.any():
+            turns.append(told.again)
     return [_outcome(part, told, group.lanes) for part, group in zip(parts, groups, strict=True)]
 
 

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import pickle
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -54,6 +55,10 @@ class AbstractCrew(abc.ABC):
     def take(self, k: int) -> Answer | None:
         """What came of share `k`; None if its process is dead."""
 
+    def lost(self) -> str:
+        """Why the last process that died did, in words; "" where that is not known."""
+        return ""
+
     @abc.abstractmethod
     def close(self) -> None:
         """End what is under way."""
@@ -70,11 +75,13 @@ def enlist() -> None:
 
 def answer(load: Callable[[], tuple[list[Part], Any]], spared: bool) -> Answer:
     """Play the slices that are loaded, of a task of which so much is told."""
+    env: Any
     try:
         parts, told = load()
-        env: Any = parts[0].env
+        env = parts[0].env
         foreign.know(env, told)
-    except Exception as error:  # a class of the user's script, which this process did not run
+    except (ImportError, AttributeError, pickle.PicklingError) as error:
+        # A class of the user's script, which this process did not run.
         return "unknown", f"{type(error).__name__}: {error}"
     try:
         foreign.spare(not spared)

@@ -47,6 +47,7 @@ class Processes(AbstractCrew):
         """Player `k`, begun if there is none."""
         one = self.all[k]
         if one is None or one.over(0.0):
+            self._drop(k)
             one = self.all[k] = _Player()
         return one
 

@@ -7,7 +7,6 @@ import functools
 import os
 import pickle
 import struct
-import sys
 
 from .crew import answer, enlist
 
@@ -17,12 +16,15 @@ ASKED = struct.Struct("=?Q")
 
 def main() -> None:
     """Play shares until there are none."""
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever prints must not look like an answer
+    asked, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    # What an environment or its children read or print is no question and no answer.
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.dup2(2, 1)
     enlist()
-    while head := sys.stdin.buffer.read(ASKED.size):
+    while head := asked.read(ASKED.size):
         spared, length = ASKED.unpack(head)
-        load = functools.partial(pickle.loads, sys.stdin.buffer.read(length))
+        load = functools.partial(pickle.loads, asked.read(length))
         message = pickle.dumps(answer(load, spared), protocol=5)
         answers.write(LENGTH.pack(len(message)))
         answers.write(message)

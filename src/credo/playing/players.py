@@ -11,6 +11,7 @@ in case the task was the reason, from then on the task has a worker, that can te
 import contextlib
 import dataclasses
 import pickle
+import sys
 import threading
 import time
 import weakref
@@ -152,15 +153,17 @@ class Players:
     def _taken(self, k: int, batch: Batch) -> Answer:
         """What came of share `k`, given out again whenever its process dies."""
         assert self.crew is not None
-        for _ in range(self.crew.tries):
+        for again in range(self.crew.tries):
+            if again:
+                self._suspects.add(batch.parts[0].env)
+                self.crew.give(batch, k, spared=True)
             answer = self.crew.take(k)
             if answer is not None:
                 return answer
-            self._suspects.add(batch.parts[0].env)
-            self.crew.give(batch, k, spared=True)
+        why = self.crew.lost()
         raise NotPlayed(
-            f"a process that plays episodes ended {self.crew.tries} times over the same ones: give "
-            "it more memory, or --processes 1 to see what happens"
+            f"a process that plays episodes ended {self.crew.tries} times over the same ones"
+            f"{f' ({why})' * bool(why)}: give it more memory, or --processes 1 to see what happens"
         )
 
     def _dismiss(self, why: str) -> None:
@@ -169,6 +172,8 @@ class Players:
         assert self.crew is not None
         if self.crew.instead:
             raise NotPlayed(f"{self.crew.instead}: {why}. Put what it names into a module")
+        with contextlib.suppress(OSError, ValueError):  # it is not read any more
+            print(f"credo: this process plays alone: {why}", file=sys.stderr)
         self.close()
         self.crew = None
 

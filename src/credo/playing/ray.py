@@ -3,6 +3,7 @@
 All that a generation plays is put into Ray's object store once; a task is told of it, which slices
 are its own, and keeps nothing but the environments that it has opened. So whatever is lost, a
 process, a node or an object, is played again, to the same bits. Nodes need no common storage.
+Environments have a worker of their own there, which ends with all that it started.
 """
 
 import contextlib
@@ -19,7 +20,7 @@ from ..environments import cluster, processes
 from . import Share, cut
 from .crew import AbstractCrew, Answer, Batch, answer, enlist
 
-STORE = 10**9  # bytes of memory for transitions, where this machine is the cluster
+ROOM = 10**9  # bytes of memory for transitions, where this machine is the cluster
 LOOK = 10.0  # seconds until the cluster is asked again how many cores it has
 
 
@@ -33,6 +34,7 @@ class Tasks(AbstractCrew):
         self._ray, self._given = ray, number
         self._counted, self._seen = -LOOK, 1
         self._setup, self._head = cluster.home(), cluster.Head(ray)
+        self._lost = ""  # why a task had no answer
         settings: dict[str, Any] = {"num_cpus": 1, "max_retries": 0}
         if self._setup["env"] and not alone:  # before a process there imports JAX
             settings["runtime_env"] = {"env_vars": self._setup["env"]}
@@ -46,6 +48,7 @@ class Tasks(AbstractCrew):
             return self._given
         now = time.monotonic()
         if now - self._counted >= LOOK:
+            self._require()
             self._counted = now
             self._seen = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
         return self._seen
@@ -59,13 +62,16 @@ class Tasks(AbstractCrew):
         self._require()
         head = pickle.dumps((batch.parts, batch.told), protocol=5, buffer_callback=buffers.append)
         arrays = [np.asarray(buffer.raw()) for buffer in buffers]
-        self._sent = batch, self._ray.put((head, arrays))
+        try:
+            self._sent = batch, self._ray.put((head, arrays))
+        except self._ray.exceptions.RayError as error:
+            raise cluster.ClusterLost(f"Ray holds no more: {cluster.brief(error)}") from error
 
     def give(self, batch: Batch, k: int, spared: bool) -> None:
         if self._sent is None or self._sent[0] is not batch:
             self.begin(batch)
         assert self._sent is not None
-        self._tasks[k] = self._play.remote(self._sent[1], batch.shares[k], self._setup, spared)
+        self._tasks[k] = self._play.remote(self._sent[1], batch.shares[k], self._setup)
 
     def _require(self) -> None:
         """Raise `ClusterLost` rather than let Ray end this process."""
@@ -74,17 +80,23 @@ class Tasks(AbstractCrew):
 
     def take(self, k: int) -> Answer | None:
         """Raises `ClusterLost` when its head does not answer any more."""
-        task, errors = self._tasks.pop(k), self._ray.exceptions
+        task, errors = self._tasks[k], self._ray.exceptions
         try:
             while not self._ray.wait([task], timeout=1.0)[0]:
                 self._require()
             self._require()
-            return self._ray.get(task)
-        except errors.RayTaskError as error:
-            return "error", cluster.brief(error)
-        except errors.RayError:
-            self._sent = None  # the object may be what was lost
-            return None
+            answer = self._ray.get(task)
+        except errors.RayError as error:
+            raised = isinstance(error, errors.RayTaskError)
+            if raised and not isinstance(error.cause, errors.RayError):
+                answer = "error", cluster.brief(error)
+            else:  # the object may be what was lost
+                self._sent, self._lost, answer = None, cluster.brief(error), None
+        del self._tasks[k]
+        return answer
+
+    def lost(self) -> str:
+        return self._lost
 
     def close(self) -> None:
         tasks, self._tasks, self._sent = list(self._tasks.values()), {}, None
@@ -98,7 +110,7 @@ def crew(address: str, number: int | None) -> Iterator[Tasks]:
     """Tasks on the cluster at an address, or of this machine if it is ""; at most `number` at the
     same time. Raises `ClusterLost` if nobody answers."""
     ray, flag = cluster.library("--rollouts ray"), "--rollouts"
-    with cluster.connected(ray, address, flag, number or 0, STORE) as alone:
+    with cluster.connected(ray, address, flag, number or 0, ROOM) as alone:
         tasks = Tasks(ray, number, alone)
         try:
             yield tasks
@@ -109,9 +121,7 @@ def crew(address: str, number: int | None) -> Iterator[Tasks]:
 _enlisted = False
 
 
-def played(
-    sent: tuple[bytes, list[np.ndarray]], share: Share, setup: Mapping[str, Any], spared: bool
-) -> Answer:
+def played(sent: tuple[bytes, list[np.ndarray]], share: Share, setup: Mapping[str, Any]) -> Answer:
     """What a task does, in a process of Ray's."""
     global _enlisted
     if not _enlisted:
@@ -128,4 +138,4 @@ def played(
         parts, told = pickle.loads(head, buffers=arrays)
         return cut(parts, share), told
 
-    return answer(load, spared)
+    return answer(load, spared=True)

@@ -346,7 +346,7 @@ def machine() -> dict[str, Any]:
     return {
         "versions": {"python": platform.python_version(), **versions},
         "processor": _processor(),
-        "cores": len(processes.cores()),
+        "cores": processes.counted(),
         "device": jax.devices()[0].device_kind,
         "system": platform.platform(),
     }

@@ -17,7 +17,7 @@ import json
 import pathlib
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -115,7 +115,7 @@ def train(
     devices.require(options.devices, algorithm.env)
     path = pathlib.Path(path) if path else free_name(algorithm, seed)
     with contextlib.ExitStack() as stack:
-        stack.enter_context(_beside(algorithm, options))
+        stack.enter_context(_where(algorithm, options))
         said = _said(algorithm, options, seed, warm_start)
         source = None if warm_start is None else Run(warm_start)
         stack.enter_context(new_folder(path))
@@ -162,7 +162,7 @@ def resume(
         run = Run(path, trust=trust)
         recorded = run.algorithm
         devices.require(options.devices, recorded.env)
-        with _beside(recorded, options):
+        with _where(recorded, options):
             fit, saved = _reopened(run, options, dict(set or {}), without_replay)
             if run.config != record.read(run.path) or (trust and not signed_here(run.config)):
                 record.write(run.path, run.config, sign=run.trusted)
@@ -170,13 +170,31 @@ def resume(
             return _train(run, fit, saved, options, heard)
 
 
-def _beside(algorithm: Any, options: RunOptions) -> contextlib.AbstractContextManager[None]:
-    """On one core, where learners learn while other processes play: neither waits for the other.
-    It is best entered before JAX counts its threads."""
+@contextlib.contextmanager
+def _where(algorithm: Any, options: RunOptions) -> Iterator[None]:
+    """On the cores and devices, and with the processes, that the run is to have.
+
+    Where learners learn while other processes play this one keeps to a core of its own, in one
+    thread, whatever the options say: so the bits are the same with any number of processes. It must
+    be known before JAX counts its threads. Raises `RunError` and `ValueError`.
+    """
     outside = isinstance(algorithm.env, AbstractHostEnvironment)
-    if getattr(algorithm, "overlap", False) and outside and options.processes is None:
-        return processes.settled()
-    return contextlib.nullcontext()
+    if options.rollouts != "local" and not outside:
+        raise ValueError(f"rollouts is {options.rollouts!r}, for tasks outside JAX: leave it out")
+    if options.rollouts != "local" and options.progress:
+        screen.say(
+            f"credo: looks for Ray, by which episodes are played (--rollouts {options.rollouts})"
+        )
+    beside = outside and getattr(algorithm, "overlap", False)
+    with contextlib.ExitStack() as stack:
+        if beside:
+            stack.enter_context(processes.settled())
+        try:
+            stack.enter_context(players.using(options.processes, options.rollouts))
+        except ClusterLost as error:
+            raise RunError(str(error)) from error
+        stack.enter_context(devices.using(options.devices))
+        yield
 
 
 # How a run begins.
@@ -383,18 +401,8 @@ def _train(
     """From `saved` to the end of the budget. The caller holds the lock."""
     training = _Training(run, algorithm, saved, options, heard)
     del saved  # its state is donated: the old one may not be held
-    if options.rollouts != "local" and not isinstance(algorithm.env, AbstractHostEnvironment):
-        raise RunError(f"--rollouts {options.rollouts} is for tasks outside JAX: leave it out")
-    try:
-        with (
-            players.using(options.processes, options.rollouts),
-            devices.using(options.devices),
-            Signals(quiet=not options.progress) as signals,
-            training.bar,
-        ):
-            reason = training.go_on(signals)
-    except ClusterLost as error:
-        raise RunError(str(error)) from error
+    with Signals(quiet=not options.progress) as signals, training.bar:
+        reason = training.go_on(signals)
     if reason == "signal":
         where = training.budget.where(training.generation, training.frames)
         raise Interrupted(
@@ -449,7 +457,7 @@ class _Training:
             self.save()
             return "budget"
         self.state, self.best = devices.everywhere((self.state, self.best))
-        self.require_sound()
+        self.require_sound(self.state, self.generation)
         self.bar.start([buffer for _, buffer in segments.buffers(self.state)])
         try:
             while not (self.reached or self.ended or signals.received):
@@ -486,23 +494,23 @@ class _Training:
         """
         self.tick = time.monotonic()
         rows = self.play()
-        self.require_sound()
-        seconds = self.report(rows)
+        self.require_sound(self.state, self.generation)
+        seconds = self.report(rows, time.monotonic())
         now, limit = self.tick, self.options.wall_clock
         if not self.ended and limit is not None and now - self.began >= limit:
             self.ended = "wall clock"
         self.reached = self.budget.reached(self.generation, self.frames, rows[-1]["champion_score"])
         if now - self.last_save >= self.options.checkpoint_every:
             self.save()
-            self.last_save = now
+            self.last_save = time.monotonic()
         # The first dispatch compiles; from the second on, its length follows the clock.
         # How many generations one dispatch holds is data and changes no result.
         again = int(np.clip(len(rows) * DISPATCH / seconds, 1, CHUNK))
         self.chunk = 2 if self.chunk == 1 else again
 
-    def report(self, rows: list[dict[str, Any]]) -> float:
-        """Write and tell of some generations; how many seconds they took. Raises `OSError`."""
-        now = time.monotonic()
+    def report(self, rows: list[dict[str, Any]], now: float) -> float:
+        """Write and tell of some generations, which were over by `now`; how many seconds they took.
+        Raises `OSError`."""
         seconds, self.tick = now - self.tick, now
         self.journal.append(rows, seconds, self.before + now - self.began)
         self.bar.update(rows[-1]["generation"], rows[-1], seconds)
@@ -510,11 +518,13 @@ class _Training:
             self.ended = "callback"
         return seconds
 
-    def overdue(self, rows: list[dict[str, Any]]) -> bool:
-        """Report these generations of a dispatch that goes on, if it is time; whether it was."""
+    def overdue(self, state: PyTree, rows: list[dict[str, Any]], ended: float) -> bool:
+        """Report these generations of a dispatch that goes on, if it is time; whether it was.
+        `ended`: when the last of them did. Raises as `dispatch` does."""
         due = bool(rows) and time.monotonic() - self.tick >= PATIENCE
         if due:
-            self.report(rows)
+            self.require_sound(state, rows[-1]["generation"] + 1)
+            self.report(rows, ended)
         return due
 
     def play(self) -> list[dict[str, Any]]:
@@ -543,15 +553,15 @@ class _Training:
             or bool(self.options.callbacks)  # each is to hear of a generation when it is over
         )
 
-    def require_sound(self) -> None:
+    def require_sound(self, state: PyTree, generation: int) -> None:
         """End a training whose weights are no numbers: nothing can be learned from there."""
-        if (what := weights.broken(self.state)) is None:
+        if (what := weights.broken(state)) is None:
             return
         stands = f"The checkpoint of generation {self.safe} stands"
-        if self.generation == self.safe:
+        if generation == self.safe:
             stands = "It began so"
         raise RunError(
-            f"the weights of {what} are not finite after generation {self.generation} of "
+            f"the weights of {what} are not finite after generation {generation} of "
             f"{self.run.path}: nothing more can be learned. {stands}; look at the size of rewards "
             "and observations, and at the learning rates (credo resume RUN --set NAME=VALUE)"
         )
@@ -632,7 +642,7 @@ def play_outside(
     frames: int,
     budget: Budget,
     enough: Callable[[], bool],
-    overdue: Callable[[list[dict[str, Any]]], bool],
+    overdue: Callable[[PyTree, list[dict[str, Any]], float], bool],
 ) -> tuple[PyTree, Best, list[dict[str, Any]]]:
     """`play` of a task outside JAX: generations until one is `enough` or the budget is reached.
     Rows that are whole and `overdue` are not returned: that has taken them.
@@ -642,6 +652,7 @@ def play_outside(
     one is waited for. How many generations one call holds changes no number of any.
     """
     rows: list[dict[str, Any]] = []
+    ended = time.monotonic()  # when the generation before did
     waiting: tuple[rollout.Postponed, PyTree] | None = None  # a test and the arrays it is of
 
     def settle(state: PyTree, best: Best, which: slice) -> tuple[PyTree, Best]:
@@ -667,8 +678,9 @@ def play_outside(
             # A generation that made no test of its own repeats the score.
             state, best = settle(state, best, slice(-2, -1 if postponed else None))
             waiting = None
-        if overdue(rows[:-1]):
+        if overdue(state, rows[:-1], ended):
             rows = rows[-1:]
+        ended = time.monotonic()
         arrays = Best.none(eqx.filter(state.champion, eqx.is_array)).policy
         if postponed:
             waiting = postponed[-1], arrays

@@ -80,7 +80,7 @@ class RunOptions:
         for name in ("keep", "processes", "devices"):
             require.at_least(name, getattr(self, name), 1)
         kind, colon, address = self.rollouts.partition(":")
-        known = kind == "ray" and bool(colon) == bool(address)
+        known = kind == "ray" and bool(colon) == bool(address) and not address.startswith("//")
         if not known and self.rollouts != "local":
             raise ValueError(
                 f"rollouts is {self.rollouts!r}: episodes are played on local, ray, ray:auto or "
