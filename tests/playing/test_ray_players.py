@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 from test_players import ENVIRONMENTS, TASK, played, same
 
@@ -123,8 +124,10 @@ def test_their_number_changes_no_bit(cluster):
         task = Gymnasium("failing:Rare", kwargs=kwargs, max_episode_steps=6, tolerated=1.0)
         with players.using(2, "ray"):
             crew = players._CURRENT.players
-            played(task, MLP(hidden=(4,)), 4, common=False, crew=crew)
-            assert crew._suspects == {task}
+            mine = played(task, MLP(hidden=(4,)), 7, 4, common=False, crew=crew)
+            assert crew._suspects == set()  # the task has a worker there
+            assert same(mine, played(task, MLP(hidden=(4,)), 7, 4, common=False))
+            assert np.isnan(mine[0].of("reward")).any()
             with pytest.raises(
                 players.NotPlayed, match=r"^--rollouts ray needs policies and tasks"
             ):
