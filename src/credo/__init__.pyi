@@ -20,6 +20,8 @@ from .environments.pettingzoo import PettingZoo as PettingZoo
 from .environments.pettingzoo import to_pettingzoo as to_pettingzoo
 from .environments.rover import Rover as Rover
 from .environments.sequence_classification import SequenceClassification as SequenceClassification
+from .environments.sequence_copy import RepeatCopy as RepeatCopy
+from .environments.sequence_copy import SequenceCopy as SequenceCopy
 from .environments.sequence_recall import SequenceRecall as SequenceRecall
 from .environments.server_fleet import ServerFleet as ServerFleet
 from .environments.simple_spread import SimpleSpread as SimpleSpread

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from . import playing, tree
 from .compilation import float32, jit
-from .environments.base import AbstractEnvironment, AbstractSequenceTask, correct
+from .environments.base import AbstractEnvironment, AbstractSequenceTask, correct, several
 from .environments.host import AbstractHostEnvironment, EnvironmentFailure, Episodes, sound
 from .environments.wrappers import Given
 from .networks.base import AbstractPolicy
@@ -451,8 +451,12 @@ def _answer_these(task: AbstractSequenceTask, members: tuple[PyTree, Sequence]) 
     pop = tree.size(population)
     packed = pack(population)
     # [pop or 1, episodes, time, ...] -> [time, ..., episodes, pop or 1]
-    inputs = jnp.transpose(sequences.inputs, (2, 3, 1, 0))
-    targets, scored = (jnp.transpose(x, (2, 1, 0)) for x in (sequences.targets, sequences.scored))
+    inputs, targets, scored = (
+        jnp.moveaxis(x, (1, 0), (-2, -1))
+        for x in (sequences.inputs, sequences.targets, sequences.scored)
+    )
+    wide = several(sequences)
+    width = targets.shape[1] if wide else 1
     lengths = sequences.length.T
     lanes = (lengths.shape[0], pop)
     carry = jax.tree.map(
@@ -462,17 +466,21 @@ def _answer_these(task: AbstractSequenceTask, members: tuple[PyTree, Sequence]) 
     def body(t, loop):
         carry, fitness, rights, perfect = loop
         x = jnp.broadcast_to(inputs[t], (inputs.shape[1], *lanes))
-        answer, carry = packed(x, carry)
+        action, carry = packed(x, carry)
         target, counts = targets[t], scored[t]
-        right = correct(answer[0], target)
-        perfect = perfect & (~counts | right)
-        reward = task.reward(answer[0], target, counts, perfect)
+        answer = action if wide else action[0]
+        right = correct(answer, target)
+        all_right = jnp.all(right, axis=0) if wide else right
+        perfect = perfect & (~counts | all_right)
+        reward = task.reward(answer, target, counts, perfect)
         fitness = fitness + jnp.where(t < lengths, reward, 0.0)
-        return carry, fitness, rights + (counts & right).astype(jnp.int32), perfect
+        hits = jnp.sum(right.astype(jnp.int32), axis=0) if wide else right.astype(jnp.int32)
+        rights = rights + jnp.where(counts, hits, 0)
+        return carry, fitness, rights, perfect
 
     start = (carry, jnp.zeros(lanes), jnp.zeros(lanes, jnp.int32), jnp.ones(lanes, bool))
     _, fitness, rights, perfect = jax.lax.fori_loop(0, jnp.max(lengths), body, start)
-    asked = jnp.sum(scored.astype(jnp.int32), axis=0)
+    asked = width * jnp.sum(scored.astype(jnp.int32), axis=0)
     returns = {
         "fitness": fitness.T,
         "accuracy": (rights.astype(jnp.float32) / asked.astype(jnp.float32)).T,

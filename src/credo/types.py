@@ -45,11 +45,12 @@ class Sequence(eqx.Module):
     """One labelled sequence, padded to a fixed number of steps.
 
     `targets` are signed: above 0 the right answer is +1, below 0 it is -1, at 0 anything goes.
-    Their size may carry meaning for a task's own reward (a running sum, say).
+    Their size may carry meaning for a task's own reward (a running sum, say). A task that asks for
+    several numbers at a step has one target for each: `[time, act]`, all scored at the same steps.
     """
 
     inputs: Float[Array, "time in"]
-    targets: Float[Array, " time"]
+    targets: Float[Array, "time *act"]
     scored: Bool[Array, " time"]  # where the answer counts
     length: Int[Array, ""]  # steps before the padding
 

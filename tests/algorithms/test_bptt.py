@@ -56,7 +56,7 @@ def test_answers_are_those_of_the_policy_alone(checkpoint):
     batch = drawn(CLASSIFICATION)
     policy = network(CLASSIFICATION)
     np.testing.assert_allclose(
-        respond(policy, batch.inputs, checkpoint),
+        respond(policy, batch.inputs, checkpoint)[..., 0],
         answers_one_by_one(policy, batch.inputs),
         atol=1e-6,
     )
@@ -208,7 +208,7 @@ def test_l2_is_part_of_what_adam_normalises():
         g = g + 0.3 * w
         m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
         w = w - 0.02 * 0.5 ** (t - 1) * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-8)
-    after, losses, frames = descend(bptt, state, key=jax.random.key(3))
+    after, losses, frames, _ = descend(bptt, state, key=jax.random.key(3))
     found, _ = jax.flatten_util.ravel_pytree(eqx.filter(after.champion, eqx.is_array))
     np.testing.assert_allclose(found, w, atol=2e-5)
     lengths = [int(jnp.sum(bptt.batch(state.examples, key=key).length)) for key in keys]

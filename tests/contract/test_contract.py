@@ -12,6 +12,7 @@ from credo import compilation, tree
 from credo.environments.base import AbstractEnvironment
 from credo.environments.probes import Copy, Locked, Meet, Remember
 from credo.environments.sequence_classification import SequenceClassification
+from credo.environments.sequence_copy import RepeatCopy, SequenceCopy
 from credo.environments.sequence_recall import SequenceRecall
 from credo.environments.wrappers import NoisyObservations, delayed
 from credo.evolution.crossover import AbstractCrossover, MaskedCrossover, OnePointCrossover
@@ -34,6 +35,8 @@ NETWORKS = {
 ENVIRONMENTS = {
     "classification": SequenceClassification(depth=2, min_gap=0, max_gap=2),
     "recall": SequenceRecall(depth=2, min_corridor=1, max_corridor=2),
+    "sequence copy": SequenceCopy(bits=2, max_length=2),
+    "repeat copy": RepeatCopy(bits=2, max_length=2, max_repeats=2),
     "copy": Copy(size=2, max_steps=2),
     "locked": Locked(size=1, hold=1, max_steps=2),
     "remember": Remember(delay=1),

@@ -17,6 +17,7 @@ from credo.networks.mmu import MMU
 TASKS = {
     "credo/SequenceClassification-v0": {"depth": 3, "min_gap": 1, "max_gap": 3},
     "credo/SequenceRecall-v0": {"depth": 2, "min_corridor": 1, "max_corridor": 3},
+    "credo/SequenceCopy-v0": {"bits": 2, "max_length": 3},
 }
 
 
@@ -25,10 +26,11 @@ def env(request):
     return gymnasium.make(request.param, **TASKS[request.param])
 
 
-def play(env, seed, act=lambda obs: np.float32([1.0])):
+def play(env, seed, act=None):
     """Observations and rewards of one episode, and how it ended."""
     obs, info = env.reset(seed=seed)
     seen, rewards, ended = [obs], [], False
+    act = act or (lambda obs: np.ones(env.action_space.shape, np.float32))
     while not ended:
         obs, reward, terminated, truncated, info = env.step(act(obs))
         ended = terminated or truncated
@@ -50,7 +52,7 @@ def test_spaces_are_those_of_the_task(env):
     low, high = task.obs_range
     assert np.all(env.observation_space.low == low)
     assert np.all(env.observation_space.high == high)
-    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (task.action_size,), np.float32)
 
 
 def test_a_seed_is_an_episode(env):

@@ -30,7 +30,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .. import require, tree
 from ..compilation import float32, jit
-from ..environments.base import AbstractSequenceTask
+from ..environments.base import AbstractSequenceTask, cross_entropy
 from ..learners.base import adam, adam_state
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.mmu import MMU
@@ -73,6 +73,9 @@ class BPTT(eqx.Module):
     max_norm: float | None = None  # to which the gradient with its L2 is clipped, ≥ 0; None: not
     reduction: Literal["mean", "sum"] = eqx.field(static=True, default="mean")
     """How the losses of all questions in a batch become one number."""
+    loss: Literal["smooth_l1", "cross_entropy"] = eqx.field(static=True, default="smooth_l1")
+    """The loss of one answer: smooth L1 of outputs in [0, 1], as in the dissertation, or
+    cross-entropy in nats, which reads an output as the probability of class +1."""
     checkpoint: int | None = eqx.field(static=True, default=None)
     """Steps from one stored carry to the next, at least 1; what lies between is computed again for
     the gradient. Memory is least near √steps. None: 1 up to 1000 steps, then √steps."""
@@ -92,6 +95,7 @@ class BPTT(eqx.Module):
             require.at_least(name, getattr(self, name), 0)
         require.within("decay", self.decay, 0, 1)
         require.choice("reduction", self.reduction, ("mean", "sum"))
+        require.choice("loss", self.loss, ("smooth_l1", "cross_entropy"))
         if self.train_size is not None and self.train_size < self.batch_size:
             raise ValueError(
                 f"train_size is {self.train_size}: a batch of {self.batch_size} different "
@@ -134,9 +138,10 @@ class BPTT(eqx.Module):
 
     @float32()
     def generation(self, state: BPTTState, *, key: PRNGKeyArray) -> tuple[BPTTState, Metrics]:
-        """`updates` steps of Adam, and a test of the network on fresh sequences."""
+        """`updates` steps of Adam, and a test of the network on fresh sequences. With cross-entropy
+        the metric `bits` is its sum over a sequence of the batches, on average, in bits."""
         learn_key, test_key = jax.random.split(key)
-        state, losses, frames = descend(self, state, key=learn_key)
+        state, losses, frames, questions = descend(self, state, key=learn_key)
         test = evaluate(self.env, tree.single(state.champion), self.test_episodes, key=test_key)
         metrics = {
             "loss": jnp.mean(losses),
@@ -145,6 +150,9 @@ class BPTT(eqx.Module):
             "instances": jnp.int32(self.updates * self.batch_size),
             "updates": jnp.int32(self.updates),
         }
+        if self.loss == "cross_entropy":
+            summed = losses if self.reduction == "sum" else losses * questions
+            metrics["bits"] = jnp.mean(summed) / (self.batch_size * math.log(2))
         return state, metrics
 
     def batch(self, examples: PRNGKeyArray, *, key: PRNGKeyArray) -> Sequence:
@@ -164,9 +172,9 @@ def kaiming(network: AbstractNetwork) -> Any:
 
 
 @jit
-def descend(bptt: BPTT, state: BPTTState, *, key) -> tuple[BPTTState, Array, Array]:
-    """`updates` steps of Adam. **Returns:** the state; loss and environment steps of each batch,
-    `[updates]`."""
+def descend(bptt: BPTT, state: BPTTState, *, key) -> tuple[BPTTState, Array, Array, Array]:
+    """`updates` steps of Adam. **Returns:** the state; of each batch the loss, environment steps,
+    and the weight of all questions, `[updates]`."""
     dynamic, static = eqx.partition(state, eqx.is_array)
 
     def update(dynamic, key):
@@ -179,24 +187,30 @@ def descend(bptt: BPTT, state: BPTTState, *, key) -> tuple[BPTTState, Array, Arr
         rate = bptt.learning_rate * bptt.decay ** state.done.astype(jnp.float32)
         champion, optimizer = adam(state.champion, gradient, state.optimizer, rate, bptt.max_norm)
         state = replace(state, champion=champion, optimizer=optimizer, done=state.done + 1)
-        return eqx.filter(state, eqx.is_array), (loss, jnp.sum(batch.length))
+        questions = jnp.sum(jax.vmap(bptt.env.lesson)(batch)[1])
+        return eqx.filter(state, eqx.is_array), (loss, jnp.sum(batch.length), questions)
 
     keys = jax.random.split(key, bptt.updates)
-    dynamic, (losses, frames) = jax.lax.scan(update, dynamic, keys)
-    return eqx.combine(dynamic, static), losses, frames
+    dynamic, (losses, frames, questions) = jax.lax.scan(update, dynamic, keys)
+    return eqx.combine(dynamic, static), losses, frames, questions
 
 
 def loss_of(policy: AbstractPolicy, bptt: BPTT, batch: Sequence) -> Float[Array, ""]:
-    """Smooth L1 (Girshick 2015, equation 3) of the answers that were asked for."""
+    """Smooth L1 (Girshick 2015, equation 3), or cross-entropy, of the answers that were asked
+    for."""
     targets, asked = jax.vmap(bptt.env.lesson)(batch)
     answers = respond(policy, batch.inputs, bptt.checkpoint)
-    total = jnp.sum(asked * optax.huber_loss(0.5 * (answers - targets)))
+    answers = answers if targets.ndim == answers.ndim else answers[..., 0]
+    if bptt.loss == "cross_entropy":
+        total = jnp.sum(asked * cross_entropy(answers, targets))
+    else:
+        total = jnp.sum(asked * optax.huber_loss(0.5 * (answers - targets)))
     return total if bptt.reduction == "sum" else total / jnp.sum(asked)
 
 
 def respond(
     policy: AbstractPolicy, inputs: Float[Array, "batch time in"], checkpoint: int | None = None
-) -> Float[Array, "batch time"]:
+) -> Float[Array, "batch time act"]:
     """The answers of one policy at every step, for gradients.
 
     Of the forward pass only carries are kept, one every `checkpoint` steps; what a step computes
@@ -209,7 +223,7 @@ def respond(
 
     def step(carry, x):
         action, carry = each(x, carry)
-        return carry, action[:, 0]
+        return carry, action
 
     def segment(carry, xs):
         return jax.lax.scan(jax.checkpoint(step), carry, xs)
@@ -218,10 +232,10 @@ def respond(
     carry = jax.vmap(lambda key: policy.start(key=key))(keys)
     xs = jnp.moveaxis(inputs, 1, 0)
     if size == 1:
-        return segment(carry, xs)[1].T
+        return jnp.swapaxes(segment(carry, xs)[1], 0, 1)
     # Steps behind the end fill the last segment; their answers are not asked for.
     count = -(-steps // size)
     xs = jnp.pad(xs, ((0, count * size - steps), (0, 0), (0, 0)))
     xs = xs.reshape(count, size, *xs.shape[1:])
     answers = jax.lax.scan(jax.checkpoint(segment), carry, xs)[1]
-    return answers.reshape(-1, n)[:steps].T
+    return jnp.swapaxes(answers.reshape(count * size, *answers.shape[2:])[:steps], 0, 1)

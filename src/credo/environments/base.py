@@ -5,6 +5,7 @@ import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
@@ -101,12 +102,15 @@ class SequenceState(eqx.Module):
 
 
 class AbstractSequenceTask(AbstractEnvironment):
-    """Read a sequence, answer at each step with one number in [-1, 1].
+    """Read a sequence, answer at each step with one number in [-1, 1], or with several.
 
     A task says how to `sample` a labelled sequence and what an answer is worth; the environment
     below and the fast path of `rollout.evaluate` both follow from that.
     Signals: `fitness`, the sum of `reward` over all steps before the padding; `accuracy`, the
     share of the scored answers that were right; and `success`, 1 at the last step if all were.
+
+    A task of several numbers at a step says so by `action_size`, and by targets `[time, act]`;
+    answers then have that axis too, before any batch.
     """
 
     action_size: ClassVar[int] = 1
@@ -121,18 +125,22 @@ class AbstractSequenceTask(AbstractEnvironment):
     @abc.abstractmethod
     def reward(
         self,
-        answer: Float[Array, "*batch"],
-        target: Float[Array, "*batch"],
+        answer: Float[Array, "*act_and_batch"],
+        target: Float[Array, "*act_and_batch"],
         scored: Bool[Array, "*batch"],
         perfect: Bool[Array, "*batch"],
     ) -> Float[Array, "*batch"]:
-        """What one answer is worth, elementwise. `perfect`: every scored answer of this sequence
-        was right, this one included."""
+        """What the answer of one step is worth: elementwise, and of several numbers their sum over
+        the first axis. `perfect`: every scored answer of this sequence was right, this one
+        included."""
 
-    def lesson(self, sequence: Sequence) -> tuple[Float[Array, " time"], Float[Array, " time"]]:
+    def lesson(
+        self, sequence: Sequence
+    ) -> tuple[Float[Array, "time *act"], Float[Array, "time *act"]]:
         """What training by gradient asks for: at each step the right answer in [-1, 1], and the
         weight of a mistake, 0 for none. By default ±1 where the answer is scored."""
-        asked = sequence.scored & (sequence.targets != 0)
+        scored = sequence.scored[:, None] if several(sequence) else sequence.scored
+        asked = scored & (sequence.targets != 0)
         return jnp.sign(sequence.targets), asked.astype(jnp.float32)
 
     def reset(self, *, key: PRNGKeyArray) -> tuple[SequenceState, TimeStep]:
@@ -140,8 +148,10 @@ class AbstractSequenceTask(AbstractEnvironment):
         state = SequenceState(sequence, jnp.int32(0), jnp.bool_(True))
         return state, _time_step(state, {name: jnp.float32(0.0) for name in self.signals})
 
-    def viewer(self) -> Viewer:
-        """Inputs, answers, and which of them were right."""
+    def viewer(self) -> Viewer | None:
+        """Inputs, answers, and which of them were right; None if there are several at a step."""
+        if several(jax.eval_shape(lambda: self.sample(key=jax.random.key(0)))):
+            return None
         return Viewer(
             "sequence",
             f"{type(self.unwrapped).__name__}: read a sequence and answer at each step; some "
@@ -166,17 +176,18 @@ class AbstractSequenceTask(AbstractEnvironment):
         }
 
     def step(
-        self, state: SequenceState, action: Float[Array, " 1"], *, key: PRNGKeyArray
+        self, state: SequenceState, action: Float[Array, " act"], *, key: PRNGKeyArray
     ) -> tuple[SequenceState, TimeStep]:
         sequence, step = state.sequence, state.step
         target, scored = sequence.targets[step], sequence.scored[step]
-        right = correct(action[0], target)
-        perfect = state.perfect & (~scored | right)
+        answer = action if several(sequence) else action[0]
+        right = correct(answer, target)
+        perfect = state.perfect & (~scored | jnp.all(right))
         asked = jnp.sum(sequence.scored.astype(jnp.float32))
         ends = step + 1 >= sequence.length
         rewards = {
-            "fitness": self.reward(action[0], target, scored, perfect),
-            "accuracy": (scored & right).astype(jnp.float32) / asked,
+            "fitness": self.reward(answer, target, scored, perfect),
+            "accuracy": jnp.mean((scored & right).astype(jnp.float32)) / asked,
             "success": (ends & perfect).astype(jnp.float32),
         }
         state = SequenceState(sequence, step + 1, perfect)
@@ -186,6 +197,23 @@ class AbstractSequenceTask(AbstractEnvironment):
 def correct(answer: Float[Array, "*b"], target: Float[Array, "*b"]) -> Bool[Array, "*b"]:
     """An answer of 0 or more means class +1. A target of 0 accepts anything; NaN is no answer."""
     return (target == 0) | jnp.where(target > 0, answer >= 0, answer < 0)
+
+
+def several(sequence: Sequence) -> bool:
+    """Whether there are several answers at a step. Leaves may have further axes in front."""
+    return sequence.targets.ndim > sequence.scored.ndim
+
+
+CERTAIN = 1e-6  # the least probability of an answer: a wrong one costs at most 20 bits
+
+
+def cross_entropy(answer: Float[Array, "*b"], target: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Cross-entropy of answers to targets, both in [-1, 1], in nats, elementwise. (1 + answer) / 2
+    is read as the probability of class +1; at least `CERTAIN`, so that the cost is finite."""
+    shrink = 1.0 - 2.0 * CERTAIN
+    p, q = 0.5 + 0.5 * shrink * answer, 0.5 + 0.5 * target
+    r = 0.5 - 0.5 * shrink * answer  # 1 - p, without its rounding
+    return -q * jnp.log(p) - (1.0 - q) * jnp.log(r)
 
 
 def _time_step(state: SequenceState, rewards: dict[str, Array]) -> TimeStep:

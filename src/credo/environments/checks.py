@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from ..types import Sequence, TimeStep
-from .base import AbstractEnvironment, AbstractSequenceTask
+from .base import AbstractEnvironment, AbstractSequenceTask, several
 from .host import AbstractCopies, AbstractHostEnvironment, HostStep, failure_of
 
 KEYS = 16  # episodes and sequences that are looked at
@@ -274,9 +274,11 @@ def _sequence(task: AbstractSequenceTask) -> list[str]:
     if not isinstance(sequence, Sequence):
         return [f"sample: the result is {type(sequence).__name__}: return a Sequence"]
     time = (task.max_steps,)
+    one = task.action_size == 1 and jnp.ndim(sequence.targets) < 2
+    answers = time if one else (*time, task.action_size)
     problems = [
         *_array("sample: inputs", sequence.inputs, (*time, task.obs_size), np.float32),
-        *_array("sample: targets", sequence.targets, time, np.float32),
+        *_array("sample: targets", sequence.targets, answers, np.float32),
         *_array("sample: scored", sequence.scored, time, np.bool_),
         *_array("sample: length", sequence.length, (), np.int32),
     ]
@@ -321,13 +323,16 @@ def _sequences(task: AbstractSequenceTask) -> list[str]:
 
 
 def _sequence_reward(task: AbstractSequenceTask) -> list[str]:
-    """`reward` acts elementwise: the fast path calls it with whole populations."""
+    """`reward` acts elementwise, but for the axis of several answers: the fast path calls it with
+    whole populations."""
     answer, target = jnp.meshgrid(jnp.array([-1.0, 0.0, 0.5, 1.0]), jnp.array([-1.0, 0.0, 1.0]))
     scored, perfect = jnp.ones((3, 4), bool), jnp.zeros((3, 4), bool)
+    if several(jax.eval_shape(lambda: task.sample(key=jax.random.key(0)))):
+        answer, target = (jnp.stack([x] * task.action_size) for x in (answer, target))
     reward = task.reward(answer, target, scored, perfect)
     problems = _array("reward: its value for answers of shape (3, 4)", reward, (3, 4), np.float32)
     if not problems:
-        one = task.reward(answer[1, 2], target[1, 2], scored[1, 2], perfect[1, 2])
+        one = task.reward(answer[..., 1, 2], target[..., 1, 2], scored[1, 2], perfect[1, 2])
         if not np.allclose(one, reward[1, 2]):
             problems.append(
                 f"reward: one answer alone earns {one}, within a batch {reward[1, 2]}: work "

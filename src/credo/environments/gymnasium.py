@@ -31,6 +31,8 @@ TASKS = {
         "credo.environments.sequence_classification:SequenceClassification"
     ),
     "credo/SequenceRecall-v0": "credo.environments.sequence_recall:SequenceRecall",
+    "credo/SequenceCopy-v0": "credo.environments.sequence_copy:SequenceCopy",
+    "credo/RepeatCopy-v0": "credo.environments.sequence_copy:RepeatCopy",
 }
 
 

@@ -28,6 +28,7 @@ class AbstractCut(AbstractSequenceTask):
     task: AbstractSequenceTask  # the task that says what an answer is worth
 
     unwrapped = _of("task", "unwrapped")
+    action_size = _of("task", "action_size")
 
     def lesson(self, sequence):
         return self.task.lesson(sequence)
