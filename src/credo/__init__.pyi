@@ -55,6 +55,7 @@ from .learners.td3 import matd3 as matd3
 from .networks.base import AbstractNetwork as AbstractNetwork
 from .networks.base import AbstractPolicy as AbstractPolicy
 from .networks.dmmu import DMMU as DMMU
+from .networks.dnc import DNC as DNC
 from .networks.exploration import Explorer as Explorer
 from .networks.exploration import GaussianNoise as GaussianNoise
 from .networks.exploration import OrnsteinUhlenbeck as OrnsteinUhlenbeck
@@ -64,6 +65,7 @@ from .networks.mlp import AbstractCriticNetwork as AbstractCriticNetwork
 from .networks.mlp import Critic as Critic
 from .networks.mlp import ResidualCritic as ResidualCritic
 from .networks.mmu import MMU as MMU
+from .networks.ntm import NTM as NTM
 from .networks.recurrent import Recurrent as Recurrent
 from .networks.team import Centralized as Centralized
 from .networks.team import JointCritic as JointCritic

@@ -502,6 +502,182 @@ class Recurrent:
         return w[f"W_{name}"] @ x + w[f"U_{name}"] @ h + w[f"b_{name}"]
 
 
+class Controller:
+    """Of `credo.networks.external_memory`, whose input is the observation and what was read."""
+
+    GATES: ClassVar[str] = "ifoc"
+
+    def __init__(self, node: Node, read: int):
+        self.lstm, h = node.config["controller"] == "lstm", node.config["hidden"]
+        self.weights: Weights = {}
+        for gate in self.GATES if self.lstm else "h":
+            shapes = {f"W_{gate}": (h, node.x + read), f"b_{gate}": (h,)}
+            shapes |= {f"U_{gate}": (h, h)} if self.lstm else {}
+            self.weights |= {name: node.claim(name, *shape) for name, shape in shapes.items()}
+        outputs = {"Z_y": (node.y, h), "Z_r": (node.y, read), "b_y": (node.y,)}
+        self.weights |= {name: node.claim(name, *shape) for name, shape in outputs.items()}
+        self._activation = node.config["output_activation"]
+
+    def __call__(self, x: np.ndarray, state: Any) -> tuple[np.ndarray, Any]:
+        """The output of its hidden layer, and its state."""
+        w = self.weights
+        if not self.lstm:
+            return np.tanh(w["W_h"] @ x + w["b_h"]), state
+        h, c = state
+        i, f, o, new = (w[f"W_{g}"] @ x + w[f"U_{g}"] @ h + w[f"b_{g}"] for g in self.GATES)
+        c = _sigmoid(f) * c + _sigmoid(i) * np.tanh(new)
+        h = _sigmoid(o) * np.tanh(c)
+        return h, (h, c)
+
+    def action(self, h: np.ndarray, read: np.ndarray) -> np.ndarray:
+        """What the whole network does, given what was just read."""
+        w = self.weights
+        return _act(w["Z_y"] @ h + w["Z_r"] @ read + w["b_y"], self._activation)[1]
+
+
+def _softmax(x: np.ndarray) -> np.ndarray:
+    """Of each row."""
+    e = np.exp(x - np.max(x, axis=-1, keepdims=True))
+    return e / np.sum(e, axis=-1, keepdims=True)
+
+
+def _softplus(x: np.ndarray) -> np.ndarray:
+    return np.logaddexp(x, np.float32(0.0))
+
+
+def _by_content(memory: np.ndarray, keys: np.ndarray, strengths: np.ndarray) -> np.ndarray:
+    """`[heads, rows]`: a softmax of the cosine similarity of rows with each key."""
+    of_keys, of_rows = (
+        np.sqrt(np.sum(np.square(x), axis=1) + np.float32(1e-6)) for x in (keys, memory)
+    )
+    return _softmax(strengths[:, None] * ((keys @ memory.T) / (of_keys[:, None] * of_rows[None])))
+
+
+class NTM:
+    """`credo.networks.ntm`: Graves et al. (2014). The memory is (the controller's state, what was
+    read, weightings of the reading heads and of the writing heads, rows)."""
+
+    def __init__(self, node: Node):
+        c, self._heads = node.config, {"r": node.config["read_heads"]}
+        self._heads["w"], self._rows, self._width = c["write_heads"], c["rows"], c["width"]
+        self._controller = Controller(node, self._heads["r"] * self._width)
+        self._shifts, h = 2 * c["shift"] + 1, c["hidden"]
+        sizes = {"k": self._width, "beta": 1, "g": 1, "s": self._shifts, "gamma": 1}
+        self.weights: Weights = {}
+        for kind, heads in self._heads.items():
+            written = {"e": self._width, "a": self._width} if kind == "w" else {}
+            for name, size in (sizes | written).items():
+                for part, shape in (("W", (heads * size, h)), ("b", (heads * size,))):
+                    key = f"{part}_{name}_{kind}"
+                    self.weights[key] = node.claim(key, *shape)
+        self._start = {
+            f"w_{k}_0": node.claim(f"w_{k}_0", n * self._rows) for k, n in self._heads.items()
+        }
+        self._start["r_0"] = node.claim("r_0", self._heads["r"] * self._width)
+        if self._controller.lstm:
+            self._start |= {name: node.claim(name, h) for name in ("h_0", "c_0")}
+        if c["start_memory"] == "learned":
+            self._start["M_0"] = node.claim("M_0", self._rows, self._width)
+
+    def start(self, random: "np.random.Generator") -> Any:
+        s = self._start
+        state = (s["h_0"], s["c_0"]) if self._controller.lstm else ()
+        at = [_softmax(s[f"w_{kind}_0"].reshape(-1, self._rows)) for kind in "rw"]
+        constant = np.full((self._rows, self._width), 1e-6, np.float32)
+        return state, s["r_0"], *at, s.get("M_0", constant)
+
+    def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
+        state, read, at_read, at_write, rows = memory
+        h, state = self._controller(np.concatenate([x, read]), state)
+        at_write = self._address("w", h, at_write, rows)
+        erase, added = _sigmoid(self._emitted("e", "w", h)), self._emitted("a", "w", h)
+        kept = np.prod(1.0 - at_write[:, :, None] * erase[:, None], axis=0)
+        rows = rows * kept + at_write.T @ added
+        at_read = self._address("r", h, at_read, rows)
+        read = (at_read @ rows).ravel()
+        return self._controller.action(h, read), (state, read, at_read, at_write, rows)
+
+    def _emitted(self, name: str, kind: str, h: np.ndarray) -> np.ndarray:
+        w, key = self.weights, f"{name}_{kind}"
+        return (w[f"W_{key}"] @ h + w[f"b_{key}"]).reshape(self._heads[kind], -1)
+
+    def _address(self, kind: str, h: np.ndarray, before: np.ndarray, rows: Any) -> np.ndarray:
+        names = ("k", "beta", "g", "s", "gamma")
+        k, beta, g, s, gamma = (self._emitted(name, kind, h) for name in names)
+        g, s = _sigmoid(g), _softmax(s)
+        w = g * _by_content(rows, k, _softplus(beta[:, 0])) + (1.0 - g) * before
+        n = self._shifts // 2
+        w = sum(s[:, i, None] * np.roll(w, i - n, axis=1) for i in range(self._shifts))
+        return _softmax((1.0 + _softplus(gamma)) * np.log(w + np.float32(1e-12)))
+
+
+class DNC:
+    """`credo.networks.dnc`: Graves et al. (2016). The memory is (the controller's state, what was
+    read, weightings of the reading heads and of the writing head, usage, precedence, links, rows).
+    """
+
+    def __init__(self, node: Node):
+        c, h = node.config, node.config["hidden"]
+        self._rows, self._width, self._heads = c["rows"], c["width"], c["read_heads"]
+        r, w, self._hidden = self._heads, self._width, h
+        self._controller = Controller(node, r * w)
+        parts = {"k_r": r * w, "beta_r": r, "f_r": r, "pi_r": 3 * r}
+        parts |= {"k_w": w, "beta_w": 1, "e_w": w, "v_w": w, "ga_w": 1, "gw_w": 1}
+        self.weights: Weights = {}
+        for name, size in parts.items():
+            self.weights[f"W_{name}"] = node.claim(f"W_{name}", size, h)
+            self.weights[f"b_{name}"] = node.claim(f"b_{name}", size)
+
+    def start(self, random: "np.random.Generator") -> Any:
+        def zeros(*shape: int) -> np.ndarray:
+            return np.zeros(shape, np.float32)
+
+        n, heads, h = self._rows, self._heads, self._hidden
+        state = (zeros(h), zeros(h)) if self._controller.lstm else ()
+        read, at_read, rows = zeros(heads * self._width), zeros(heads, n), zeros(n, self._width)
+        return state, read, at_read, zeros(n), zeros(n), zeros(n), zeros(n, n), rows
+
+    def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
+        state, read, at_read, at_write, used, last, links, rows = memory
+        h, state = self._controller(np.concatenate([x, read]), state)
+        retained = np.prod(1.0 - _sigmoid(self._emitted("f_r", h))[:, None] * at_read, axis=0)
+        used = (used + at_write - used * at_write) * retained
+        at_write = self._where_to_write(h, used, rows)
+        erase, added = _sigmoid(self._emitted("e_w", h)), self._emitted("v_w", h)
+        rows = rows * (1.0 - np.outer(at_write, erase)) + np.outer(at_write, added)
+        kept = 1.0 - at_write[:, None] - at_write[None]
+        links = kept * links + np.outer(at_write, last)
+        np.fill_diagonal(links, 0.0)
+        last = (1.0 - np.sum(at_write)) * last + at_write
+        at_read = self._where_to_read(h, at_read, links, rows)
+        read = (at_read @ rows).ravel()
+        memory = state, read, at_read, at_write, used, last, links, rows
+        return self._controller.action(h, read), memory
+
+    def _emitted(self, name: str, h: np.ndarray) -> np.ndarray:
+        return self.weights[f"W_{name}"] @ h + self.weights[f"b_{name}"]
+
+    def _where_to_write(self, h: np.ndarray, used: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        order = np.argsort(used, kind="stable")
+        u, allocated = used[order], np.zeros_like(used)
+        allocated[order] = (1.0 - u) * np.concatenate([[np.float32(1.0)], np.cumprod(u)[:-1]])
+        strength = 1.0 + _softplus(self._emitted("beta_w", h))
+        found = _by_content(rows, self._emitted("k_w", h)[None], strength)[0]
+        g_a, g_w = (_sigmoid(self._emitted(name, h)) for name in ("ga_w", "gw_w"))
+        return g_w * (g_a * allocated + (1.0 - g_a) * found)
+
+    def _where_to_read(
+        self, h: np.ndarray, before: np.ndarray, links: np.ndarray, rows: np.ndarray
+    ) -> np.ndarray:
+        n = self._heads
+        mode = _softmax(self._emitted("pi_r", h).reshape(n, 3))
+        keys, strengths = self._emitted("k_r", h).reshape(n, -1), self._emitted("beta_r", h)
+        found = _by_content(rows, keys, 1.0 + _softplus(strengths))
+        return (
+            mode[:, :1] * (before @ links) + mode[:, 1:2] * found + mode[:, 2:] * (before @ links.T)
+        )
+
+
 class Team:
     """`credo.networks.team`: a head for each agent on a trunk, of each one or one for all. The
     memory is that of each head."""
@@ -605,6 +781,8 @@ NETWORKS: dict[str, tuple[Callable[[Node], Any], bool | None]] = {
     "MLP": (MLP, False),
     "MMU": (MMU, False),
     "Recurrent": (Recurrent, False),
+    "NTM": (NTM, False),
+    "DNC": (DNC, False),
     "Team": (Team, True),
     "DMMU": (DMMU, True),
     "Centralized": (Centralized, True),

@@ -19,8 +19,10 @@ from credo.evolution.crossover import AbstractCrossover, MaskedCrossover, OnePoi
 from credo.evolution.extinction import Extinction
 from credo.evolution.mutation import GaussianMutation, MatrixMutation, Mutations
 from credo.evolution.selection import Tournament, Truncation
+from credo.networks.dnc import DNC
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
+from credo.networks.ntm import NTM
 from credo.networks.recurrent import Recurrent
 
 N = 3  # members, worlds or genomes at once
@@ -31,6 +33,9 @@ NETWORKS = {
     "gru": Recurrent(cell="gru", hidden=2),
     "lstm": Recurrent(cell="lstm", hidden=2),
     "mlp": MLP(hidden=(2,)),
+    "ntm": NTM(hidden=2, rows=4, width=2),
+    "feed-forward ntm": NTM("feedforward", 2, 3, 2, write_heads=2, start_memory="constant"),
+    "dnc": DNC(hidden=2, rows=3, width=2, read_heads=2),
 }
 ENVIRONMENTS = {
     "classification": SequenceClassification(depth=2, min_gap=0, max_gap=2),

@@ -9,8 +9,10 @@ from reading import read
 
 from credo import rollout, tree
 from credo.networks.base import ACTIVATIONS, draw, matvec, to_action
+from credo.networks.dnc import DNC
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
+from credo.networks.ntm import NTM
 from credo.networks.recurrent import Recurrent
 
 NETWORKS = {
@@ -20,6 +22,10 @@ NETWORKS = {
     "gru": Recurrent(cell="gru", hidden=3),
     "lstm": Recurrent(cell="lstm", hidden=3),
     "mlp": MLP(hidden=(3, 3)),
+}
+EVERY = NETWORKS | {
+    "ntm": NTM(hidden=3, rows=4, width=2, initializer="fan_in"),
+    "dnc": DNC(hidden=3, rows=4, width=2, read_heads=2, initializer="fan_in"),
 }
 
 
@@ -52,9 +58,9 @@ def test_packed_population_equals_one_by_one(name):
             np.testing.assert_allclose(together[:, :, lane, member], alone, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("name", EVERY)
 def test_gradients_through_time_are_finite_and_reach_every_matrix(name):
-    policy = NETWORKS[name].init(2, 1, key=jax.random.key(0))
+    policy = EVERY[name].init(2, 1, key=jax.random.key(0))
     inputs = jax.random.normal(jax.random.key(1), (20, 2))
     loss = eqx.filter_jit(eqx.filter_grad(lambda p: jnp.sum(read(p, inputs)[0] ** 2)))
     for path, gradient in jax.tree.leaves_with_path(loss(policy)):

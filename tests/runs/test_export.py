@@ -17,9 +17,11 @@ from credo.environments.simple_spread import SimpleSpread
 from credo.environments.wrappers import DelayedHostReward
 from credo.networks.base import ACTIVATIONS, AbstractNetwork, AbstractPolicy
 from credo.networks.dmmu import DMMU
+from credo.networks.dnc import DNC
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.networks.normalized import Normalized
+from credo.networks.ntm import NTM
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Centralized, Team
 from credo.runner import DESCRIPTION, VERSION, Runner
@@ -43,6 +45,10 @@ NETWORKS = [
     MMU(4, 6, alpha=1.0, encoder="learned", decoder="learned", decoder_activation="elu"),
     MMU(4, start_weights="saturated"),
     *(Recurrent(c, 4, o) for c in ("rnn", "gru", "lstm") for o in ("sigmoid", "tanh")),
+    NTM(hidden=4, rows=6, width=3),
+    NTM("feedforward", 4, 5, 3, 2, 2, 2, start_memory="constant", output_activation="tanh"),
+    DNC(hidden=4, rows=5, width=3, read_heads=2),
+    DNC("feedforward", 4, 4, 3, 1, "tanh", "fan_in"),
 ]
 AGENTS = 3
 HEADS = (MLP((), initializer="uniform"), MMU(3), Recurrent("gru", 3), Recurrent("lstm", 3))

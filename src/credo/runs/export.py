@@ -47,8 +47,8 @@ def parts_of(policy: Any) -> tuple[dict[str, Any], Weights]:
     name = type(policy).__name__
     if not type(policy).__module__.startswith("credo.networks.") or name not in KINDS:
         raise RunError(
-            f"{name} cannot be exported: the runner knows MLP, MMU and Recurrent, teams of them, "
-            "DMMU and Centralized; from Python, Run(path).policy() plays any network"
+            f"{name} cannot be exported: the runner knows MLP, MMU, Recurrent, NTM and DNC, "
+            "teams of them, DMMU and Centralized; from Python, Run(path).policy() plays any network"
         )
     kind, own, inner = KINDS[name]
     settings = config.to_tree(getattr(policy, "config", {}))
@@ -83,6 +83,8 @@ KINDS: dict[str, tuple[str, Any, Any]] = {
     "MLPPolicy": ("MLP", lambda policy: policy.weights, lambda _: {}),
     "MMUPolicy": ("MMU", vars, lambda _: {}),
     "RecurrentPolicy": ("Recurrent", lambda policy: policy.weights, lambda _: {}),
+    "NTMPolicy": ("NTM", lambda policy: policy.weights, lambda _: {}),
+    "DNCPolicy": ("DNC", lambda policy: policy.weights, lambda _: {}),
     "TeamPolicy": ("Team", _trunks, _numbered("heads")),
     "DMMUPolicy": ("DMMU", lambda _: {}, _numbered("agents")),
     "CentralizedPolicy": ("Centralized", lambda _: {}, _within),
