@@ -33,7 +33,7 @@ NETWORKS = {
     "gru": Recurrent(cell="gru", hidden=2),
     "lstm": Recurrent(cell="lstm", hidden=2),
     "mlp": MLP(hidden=(2,)),
-    "ntm": NTM(hidden=2, rows=4, width=2),
+    "ntm": NTM("lstm", hidden=2, rows=4, width=2),
     "feed-forward ntm": NTM("feedforward", 2, 3, 2, write_heads=2, start_memory="constant"),
     "dnc": DNC(hidden=2, rows=3, width=2, read_heads=2),
 }

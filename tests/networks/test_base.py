@@ -24,7 +24,7 @@ NETWORKS = {
     "mlp": MLP(hidden=(3, 3)),
 }
 EVERY = NETWORKS | {
-    "ntm": NTM(hidden=3, rows=4, width=2, initializer="fan_in"),
+    "ntm": NTM("lstm", hidden=3, rows=4, width=2, initializer="fan_in"),
     "dnc": DNC(hidden=3, rows=4, width=2, read_heads=2, initializer="fan_in"),
 }
 

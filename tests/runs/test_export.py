@@ -45,7 +45,7 @@ NETWORKS = [
     MMU(4, 6, alpha=1.0, encoder="learned", decoder="learned", decoder_activation="elu"),
     MMU(4, start_weights="saturated"),
     *(Recurrent(c, 4, o) for c in ("rnn", "gru", "lstm") for o in ("sigmoid", "tanh")),
-    NTM(hidden=4, rows=6, width=3),
+    NTM("lstm", hidden=4, rows=6, width=3),
     NTM("feedforward", 4, 5, 3, 2, 2, 2, start_memory="constant", output_activation="tanh"),
     DNC(hidden=4, rows=5, width=3, read_heads=2),
     DNC("feedforward", 4, 4, 3, 1, "tanh", "fan_in"),

@@ -29,13 +29,15 @@ from .external_memory import Weights, by_content, control, controller_shapes
 
 LEAST = 1e-12  # added to a weight before its logarithm
 CONSTANT = 1e-6  # every entry of a memory that is not learned
+FIRST = 10.0  # how much more of every head such a memory's first row has: before the softmax
 
 
 class NTM(AbstractNetwork):
-    """Config of a Neural Turing Machine. The defaults are the paper's for Copy (Tables 1 and 2)."""
+    """Config of a Neural Turing Machine. The defaults are the paper's for Copy (Table 1)."""
 
-    controller: Literal["feedforward", "lstm"] = eqx.field(static=True, default="lstm")
-    """Feedforward (one layer of tanh), or lstm."""
+    controller: Literal["feedforward", "lstm"] = eqx.field(static=True, default="feedforward")
+    """Feedforward (one layer of tanh), or lstm, with which Copy took longer to learn
+    (docs/algorithms/ntm.md)."""
     hidden: int = eqx.field(static=True, default=100)  # units of the controller, at least 1
     rows: int = eqx.field(static=True, default=128)  # memory locations N, at least 1
     width: int = eqx.field(static=True, default=20)  # numbers in a memory location M, at least 1
@@ -45,7 +47,8 @@ class NTM(AbstractNetwork):
     """Rows that a head can move at most in one step, in either direction, at least 0; 2·shift + 1
     is at most `rows`."""
     start_memory: Literal["learned", "constant"] = eqx.field(static=True, default="learned")
-    """Memory at the first step: learned, or 10⁻⁶ everywhere (Collier & Beel 2018)."""
+    """Memory at the first step: learned, or 10⁻⁶ everywhere (Collier & Beel 2018). In that case
+    fresh heads start at the first row: equal rows that are looked at equally stay equal."""
     output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
     """Activation of the output layer."""
     initializer: str = eqx.field(static=True, default="normal")
@@ -65,7 +68,11 @@ class NTM(AbstractNetwork):
 
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> "NTMPolicy":
         shapes = self._controller(obs_size, action_size) | self._heads() | self._start()
-        return NTMPolicy(draw(shapes, self.initializer, key=key), self)
+        weights = draw(shapes, self.initializer, key=key)
+        if self.start_memory == "constant":
+            for name in ("w_r_0", "w_w_0"):
+                weights[name] = weights[name].at[:: self.rows].add(FIRST)
+        return NTMPolicy(weights, self)
 
     def _controller(self, x: int, y: int) -> dict[str, tuple[int, ...]]:
         h, read = self.hidden, self.read_heads * self.width
