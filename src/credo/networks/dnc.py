@@ -14,6 +14,7 @@ Departures from the paper, and what it leaves open:
   rows keep the order they are stored in, which the paper leaves open.
 """
 
+import functools
 from typing import ClassVar, Literal
 
 import equinox as eqx
@@ -77,7 +78,7 @@ class DNCPolicy(AbstractPolicy):
     config: DNC = eqx.field(static=True)
 
     def start(self, *, key: PRNGKeyArray | None = None):
-        c, zeros = self.config, jnp.zeros
+        c, zeros = self.config, functools.partial(jnp.zeros, dtype=jnp.float32)
         state = (zeros(c.hidden), zeros(c.hidden)) if c.controller == "lstm" else ()
         read, at_read = zeros(c.read_heads * c.width), zeros((c.read_heads, c.rows))
         rows, links = zeros(c.rows), zeros((c.rows, c.rows))
@@ -150,7 +151,7 @@ def allocation(used: Float[Array, " rows"]) -> Float[Array, " rows"]:
     a[φ_j] = (1 - u[φ_j]) ∏ u[φ_i] over i < j. They sum to 1 at most."""
     order = jnp.argsort(jax.lax.stop_gradient(used))  # stable: of equal rows the first
     u = used[order]
-    before = jnp.concatenate([jnp.ones(1), jnp.cumprod(u)[:-1]])
+    before = jnp.concatenate([jnp.ones_like(u[:1]), jnp.cumprod(u)[:-1]])
     return jnp.zeros_like(used).at[order].set((1.0 - u) * before)
 
 
@@ -161,4 +162,4 @@ def linked(
     which `last` says how much they were written last before this."""
     kept = 1.0 - at_write[:, None] - at_write[None]
     links = kept * links + jnp.outer(at_write, last)
-    return links * (1.0 - jnp.eye(len(last)))
+    return links * (1.0 - jnp.eye(len(last), dtype=links.dtype))

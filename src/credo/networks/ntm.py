@@ -123,7 +123,7 @@ class NTMPolicy(AbstractPolicy):
         w, c = self.weights, self.config
         state = (w["h_0"], w["c_0"]) if c.controller == "lstm" else ()
         at = [jax.nn.softmax(w[name].reshape(-1, c.rows), axis=1) for name in ("w_r_0", "w_w_0")]
-        memory = w["M_0"] if "M_0" in w else jnp.full((c.rows, c.width), CONSTANT)
+        memory = w["M_0"] if "M_0" in w else jnp.full((c.rows, c.width), CONSTANT, jnp.float32)
         return state, w["r_0"], *at, memory
 
     def __call__(self, obs, carry):
