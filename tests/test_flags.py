@@ -9,12 +9,14 @@ from credo.algorithms.bptt import BPTT
 from credo.algorithms.ccea import CCEA
 from credo.algorithms.erl import ERL
 from credo.algorithms.merl import MERL
+from credo.algorithms.neat import NEAT
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.algorithms.off_policy import OffPolicy
 from credo.algorithms.ppo import PPO
 from credo.environments.probes import Copy, Meet, Remember
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3, ddpg, maddpg, matd3
+from credo.networks.graph import Graph
 from credo.networks.mlp import MLP, Critic
 from credo.networks.mmu import MMU
 from credo.networks.team import JointCritic, Team
@@ -30,6 +32,9 @@ HYBRID = EVOLUTION | LEARN | {"warmup_frames": 5, "workers": 1}
 COPY, MEET = Copy(max_steps=4), Meet()
 MAKE = {
     "neuroevolution": lambda: Neuroevolution.as_written(COPY, NETWORK, **EVOLUTION),
+    "neat": lambda: NEAT(
+        COPY, Graph(hidden=2), population_size=4, connections=4, episodes=1, test_episodes=1
+    ),
     "bptt": lambda: BPTT(Remember(2), MMU(hidden=2), batch_size=2, test_episodes=1),
     "ccea": lambda: CCEA.ccea(MEET, NETWORK, teams=1, **EVOLUTION),
     "erl": lambda: ERL.erl(COPY, NETWORK, learners=(ddpg(**TINY),), **HYBRID),

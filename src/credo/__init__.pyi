@@ -6,6 +6,7 @@ from .algorithms.ccea import CCEA as CCEA
 from .algorithms.erl import ERL as ERL
 from .algorithms.fitness import Parsimony as Parsimony
 from .algorithms.merl import MERL as MERL
+from .algorithms.neat import NEAT as NEAT
 from .algorithms.neuroevolution import Neuroevolution as Neuroevolution
 from .algorithms.off_policy import OffPolicy as OffPolicy
 from .algorithms.ppo import PPO as PPO
@@ -59,6 +60,7 @@ from .networks.dnc import DNC as DNC
 from .networks.exploration import Explorer as Explorer
 from .networks.exploration import GaussianNoise as GaussianNoise
 from .networks.exploration import OrnsteinUhlenbeck as OrnsteinUhlenbeck
+from .networks.graph import Graph as Graph
 from .networks.mlp import MLP as MLP
 from .networks.mlp import AbstractCritic as AbstractCritic
 from .networks.mlp import AbstractCriticNetwork as AbstractCriticNetwork

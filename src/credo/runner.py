@@ -26,6 +26,7 @@ EPSILON = 1e-6  # of LayerNorm, relative to the variance
 LARGEST = 2**30  # bytes of a file
 DEEPEST = 8  # networks within networks
 MOST_AGENTS = 10_000
+MOST_PASSES = 10_000
 
 Weights = dict[str, np.ndarray]
 
@@ -678,6 +679,42 @@ class DNC:
         )
 
 
+class Graph:
+    """`credo.networks.graph`: any topology. The memory is the units' activations and the contents
+    of LSTM cells."""
+
+    def __init__(self, node: Node):
+        self._y, self._h, self._passes = node.y, node.config["hidden"], node.config["passes"]
+        self._activation, cells = node.config["activation"], node.config["cells"]
+        if type(self._passes) is not int or not 1 <= self._passes <= MOST_PASSES:
+            raise ValueError(f"its passes are {self._passes!r}")
+        self._ports = {"rnn": 1, "lstm": 4}[cells]
+        rows, units = node.y + self._ports * self._h, node.y + self._h
+        self._w = node.claim("W", rows, node.x + 1 + units)
+        self._gated = (self._w[units:] != 0.0).any(axis=1)  # a gate without connections is open
+
+    def start(self, random: "np.random.Generator") -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(self._y + self._h, np.float32), np.zeros(self._h, np.float32)
+
+    def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
+        units, cells = memory
+        seen = self._w[:, : x.size] @ x + self._w[:, x.size]
+        for _ in range(self._passes):
+            units, cells = self._updated(seen + self._w[:, x.size + 1 :] @ units, cells)
+        y = units[: self._y]
+        return 2.0 * y - 1.0 if self._activation == "sigmoid" else y, (units, cells)
+
+    def _updated(self, total: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        φ, slope = ACTIVATIONS[self._activation], 4.9 if self._activation == "sigmoid" else 1.0
+        if self._ports == 1:
+            return φ(slope * total), cells
+        y, h = self._y, self._h
+        gates = np.where(self._gated, _sigmoid(total[y + h :]), np.float32(1.0))
+        i, f, o = gates[:h], gates[h : 2 * h], gates[2 * h :]
+        cells = f * cells + i * np.tanh(total[y : y + h])
+        return np.concatenate([φ(slope * total[:y]), o * np.tanh(cells)]), cells
+
+
 class Team:
     """`credo.networks.team`: a head for each agent on a trunk, of each one or one for all. The
     memory is that of each head."""
@@ -783,6 +820,7 @@ NETWORKS: dict[str, tuple[Callable[[Node], Any], bool | None]] = {
     "Recurrent": (Recurrent, False),
     "NTM": (NTM, False),
     "DNC": (DNC, False),
+    "Graph": (Graph, False),
     "Team": (Team, True),
     "DMMU": (DMMU, True),
     "Centralized": (Centralized, True),

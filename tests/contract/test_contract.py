@@ -10,7 +10,7 @@ import pytest
 
 from credo import compilation, tree
 from credo.environments.base import AbstractEnvironment
-from credo.environments.probes import Copy, Locked, Meet, Remember
+from credo.environments.probes import Copy, Locked, Meet, Remember, Xor
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_copy import RepeatCopy, SequenceCopy
 from credo.environments.sequence_recall import SequenceRecall
@@ -20,6 +20,7 @@ from credo.evolution.extinction import Extinction
 from credo.evolution.mutation import GaussianMutation, MatrixMutation, Mutations
 from credo.evolution.selection import Tournament, Truncation
 from credo.networks.dnc import DNC
+from credo.networks.graph import Graph
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.networks.ntm import NTM
@@ -36,6 +37,8 @@ NETWORKS = {
     "ntm": NTM("lstm", hidden=2, rows=4, width=2),
     "feed-forward ntm": NTM("feedforward", 2, 3, 2, write_heads=2, start_memory="constant"),
     "dnc": DNC(hidden=2, rows=3, width=2, read_heads=2),
+    "graph": Graph(hidden=2, passes=2),
+    "graph of lstms": Graph(hidden=2, cells="lstm"),
 }
 ENVIRONMENTS = {
     "classification": SequenceClassification(depth=2, min_gap=0, max_gap=2),
@@ -45,6 +48,7 @@ ENVIRONMENTS = {
     "copy": Copy(size=2, max_steps=2),
     "locked": Locked(size=1, hold=1, max_steps=2),
     "remember": Remember(delay=1),
+    "xor": Xor(),
     "meet": Meet(),
     "delayed": delayed(Meet()),
     "noisy": NoisyObservations(Meet(), 0.1, spared=1),

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from credo.environments.probes import Copy, Locked, Meet, Remember
+from credo.environments.probes import Copy, Locked, Meet, Remember, Xor
 
 
 def play(env, policy, keys):
@@ -49,6 +49,21 @@ def test_copy_pays_minus_the_squared_distance(keys):
     assert idle["reward"].mean() == pytest.approx(-2 * 4 / 3, rel=0.1)
     off, *_ = play(env, lambda obs: obs + 0.5, keys)
     np.testing.assert_allclose(off["reward"], -4 * 2 * 0.25, rtol=1e-5)
+
+
+def test_xor_pays_the_squared_rest_of_four(keys):
+    env = Xor()
+    best, steps, last = play(env, lambda obs: jnp.where(obs[:1] != obs[1:], 1.0, -1.0), keys)
+    assert (best["fitness"] == 16.0).all()
+    assert (best["success"] == 1.0).all()
+    assert (steps == 4).all()
+    assert last.truncated.all()
+    either, *_ = play(env, lambda obs: 2.0 * jnp.max(obs, keepdims=True) - 1.0, keys)
+    assert (either["fitness"] == 9.0).all()  # wrong for the pair of ones
+    assert (either["success"] == 0.0).all()
+    undecided, *_ = play(env, lambda obs: jnp.zeros(1), keys)
+    assert (undecided["fitness"] == 4.0).all()
+    assert (undecided["success"] == 0.0).all()
 
 
 def test_copying_is_paid_behind_a_lever_that_was_held(keys):

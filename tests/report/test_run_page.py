@@ -13,6 +13,7 @@ from credo.algorithms.bptt import BPTT
 from credo.algorithms.ccea import CCEA
 from credo.algorithms.erl import ERL
 from credo.algorithms.merl import MERL
+from credo.algorithms.neat import NEAT
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.algorithms.off_policy import OffPolicy
 from credo.algorithms.ppo import PPO
@@ -113,6 +114,7 @@ def test_algorithms_are_called_what_the_command_calls_them():
         "ccea": CCEA.ccea(team),
         "neuroevolution": ALGORITHM,
         "ppo": PPO.ppo(task),
+        "neat": NEAT(task),
         "bptt": BPTT(TASK),
     }
     trees = {name: config.to_tree(algorithm) for name, algorithm in made.items()}

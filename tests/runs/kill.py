@@ -39,6 +39,8 @@ TEAM_ALONE = (
 TRAIN = {
     "neuroevolution": "neuroevolution sequence-classification --depth 3 --min-gap 1 --max-gap 3 "
     "--population-size 20 --episodes 5 --network.hidden 3",
+    "neat": "neat sequence-classification --depth 3 --min-gap 1 --max-gap 3 "
+    "--population-size 20 --episodes 5 --network.hidden 3 --connections 20",
     "bptt": "bptt sequence-recall --depth 2 --min-corridor 1 --max-corridor 3 --batch-size 20 "
     "--updates 2 --network.hidden 3 --train-size 100",
     "ccea": "ccea credo.environments.probes:Meet --population-size 6 --breeder.elite-fraction 0.2 "
@@ -65,6 +67,7 @@ TRAIN = {
 }
 GENERATIONS = {  # half of them are enough for seven disturbances
     "neuroevolution": 100_000,
+    "neat": 60_000,
     "bptt": 20_000,
     "ccea": 60_000,
     "islands": 60_000,

@@ -18,6 +18,7 @@ from credo.environments.wrappers import DelayedHostReward
 from credo.networks.base import ACTIVATIONS, AbstractNetwork, AbstractPolicy
 from credo.networks.dmmu import DMMU
 from credo.networks.dnc import DNC
+from credo.networks.graph import Graph
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.networks.normalized import Normalized
@@ -44,6 +45,8 @@ NETWORKS = [
     MMU(4, alpha=0.3),
     MMU(4, 6, alpha=1.0, encoder="learned", decoder="learned", decoder_activation="elu"),
     MMU(4, start_weights="saturated"),
+    *(Graph(4, activation=a, passes=p) for a in ("sigmoid", "tanh") for p in (1, 3)),
+    Graph(4, "lstm"),
     *(Recurrent(c, 4, o) for c in ("rnn", "gru", "lstm") for o in ("sigmoid", "tanh")),
     NTM("lstm", hidden=4, rows=6, width=3),
     NTM("feedforward", 4, 5, 3, 2, 2, 2, start_memory="constant", output_activation="tanh"),

@@ -8,6 +8,7 @@ and the best possible return is written beside it.
 | `Copy` | the observation reaches the action | 0 | -size·max_steps/3 (action 0) |
 | `Locked` | exploration by whole policies, then gradients | `max_steps` - `hold` | 0 |
 | `Remember` | memory across `delay` steps | 1 | success ½ |
+| `Xor` | a hidden unit | 16, success 1 | success 0 |
 | `Meet` | both agents of a team act | 1 (global) | 0 |
 """
 
@@ -158,6 +159,52 @@ class Remember(AbstractSequenceTask):
 
     def reward(self, answer, target, scored, perfect):
         return jnp.where(scored, answer * target, 0.0)
+
+
+class XorState(eqx.Module):
+    bits: Float[Array, "steps 2"]
+    error: Float[Array, ""]  # so far
+    right: Bool[Array, ""]  # all answers so far
+    step: Int[Array, ""]
+
+
+class Xor(AbstractEnvironment):
+    """Say whether two bits differ, for each of the four pairs once, in random order.
+
+    Observations are two bits of 0 or 1; of an action in [-1, 1] the upper half means that they
+    differ. The clock ends the episode (truncated). Signals, both at the last step: `fitness`, 4
+    less the sum of distances between answer and truth on a scale from 0 to 1, squared, as in
+    Stanley & Miikkulainen (2002), section 4.1; `success`, 1 if all four answers are on the right
+    side. Best 16 and 1. No feed-forward network without hidden units is right four times.
+    """
+
+    signals: ClassVar[tuple[str, ...]] = ("fitness", "success")
+    reported: ClassVar[str] = "success"
+    obs_range: ClassVar[tuple[float, float]] = (0.0, 1.0)
+
+    obs_size: ClassVar[int] = 2
+    action_size: ClassVar[int] = 1
+    max_steps: ClassVar[int] = 4
+
+    def reset(self, *, key: PRNGKeyArray) -> tuple[XorState, TimeStep]:
+        pairs = jnp.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
+        bits = pairs[jax.random.permutation(key, 4)]
+        return self._at(XorState(bits, jnp.float32(0.0), jnp.bool_(True), jnp.int32(0)))
+
+    def step(
+        self, state: XorState, action: Float[Array, " one"], *, key: PRNGKeyArray
+    ) -> tuple[XorState, TimeStep]:
+        answer, (x, y) = 0.5 * (1.0 + action[0]), state.bits[state.step]
+        right = state.right & ((answer > 0.5) == (x != y)) & (answer != 0.5)
+        error = state.error + jnp.abs(answer - jnp.abs(x - y))
+        return self._at(XorState(state.bits, error, right, state.step + 1))
+
+    def _at(self, state: XorState) -> tuple[XorState, TimeStep]:
+        last = state.step >= self.max_steps
+        worth = {"fitness": (4.0 - state.error) ** 2, "success": state.right.astype(jnp.float32)}
+        rewards = {name: jnp.where(last, x, 0.0) for name, x in worth.items()}
+        obs = state.bits[jnp.minimum(state.step, 3)]
+        return state, TimeStep(obs, rewards, jnp.bool_(False), last)
 
 
 class MeetState(eqx.Module):

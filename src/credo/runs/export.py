@@ -47,7 +47,7 @@ def parts_of(policy: Any) -> tuple[dict[str, Any], Weights]:
     name = type(policy).__name__
     if not type(policy).__module__.startswith("credo.networks.") or name not in KINDS:
         raise RunError(
-            f"{name} cannot be exported: the runner knows MLP, MMU, Recurrent, NTM and DNC, "
+            f"{name} cannot be exported: the runner knows MLP, MMU, Recurrent, NTM, DNC and Graph, "
             "teams of them, DMMU and Centralized; from Python, Run(path).policy() plays any network"
         )
     kind, own, inner = KINDS[name]
@@ -85,6 +85,7 @@ KINDS: dict[str, tuple[str, Any, Any]] = {
     "RecurrentPolicy": ("Recurrent", lambda policy: policy.weights, lambda _: {}),
     "NTMPolicy": ("NTM", lambda policy: policy.weights, lambda _: {}),
     "DNCPolicy": ("DNC", lambda policy: policy.weights, lambda _: {}),
+    "GraphPolicy": ("Graph", lambda policy: {"W": policy.W}, lambda _: {}),
     "TeamPolicy": ("Team", _trunks, _numbered("heads")),
     "DMMUPolicy": ("DMMU", lambda _: {}, _numbered("agents")),
     "CentralizedPolicy": ("Centralized", lambda _: {}, _within),

@@ -1,0 +1,108 @@
+"""Species of NEAT: who competes with whom, and how many offspring each species has.
+
+Source: Stanley & Miikkulainen (2002), sections 3.3 and 4.1.
+
+Departures:
+
+- There is room for a number of species. Who would found one more joins the nearest.
+- Where fitness can be negative, all of it is raised so that the lowest is 0: it is shared out in
+  proportion, and the paper's tasks have none below 0. NaN counts as the lowest.
+- The species of the fittest genome reproduces, stagnant or not, or the best would be lost.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .. import tree
+from .genome import Compatibility, Genome
+
+Fitness = Float[Array, " pop"]
+LEAST = np.float32(np.finfo(np.float32).min)  # where there is no fitness yet
+
+
+class Species(eqx.Module):
+    """What is remembered of species from one generation to the next."""
+
+    representative: PyTree  # a genome of each, leaves [species, genes]
+    alive: Bool[Array, " species"]  # False: this place is empty
+    best: Float[Array, " species"]  # highest fitness of a member so far
+    waited: Int[Array, " species"]  # generations since that was reached
+
+    @classmethod
+    def none(cls, genome: Genome, room: int) -> "Species":
+        """Before there is any."""
+        empty = jax.tree.map(lambda x: jnp.broadcast_to(x, (room, *x.shape)), genome)
+        waited = jnp.zeros(room, jnp.int32)
+        return cls(empty, jnp.zeros(room, bool), jnp.full(room, LEAST), waited)
+
+
+def speciate(
+    distance: Compatibility, threshold: float, species: Species, population: PyTree
+) -> tuple[Int[Array, " pop"], Species]:
+    """The species of each genome, one after the other: the first whose representative is nearer
+    than `threshold`, or a new one, which it represents. Without members a species is no more."""
+    blank = (jnp.float32(LEAST), jnp.int32(0))
+
+    def place(species: Species, genome: Genome) -> tuple[Species, Int[Array, ""]]:
+        away = jax.vmap(lambda other: distance(genome, other))(species.representative)
+        away = jnp.where(species.alive, away, jnp.inf)
+        known, room = jnp.any(away < threshold), ~jnp.all(species.alive)
+        founds = ~known & room
+        joins = jnp.where(known, jnp.argmax(away < threshold), jnp.argmin(away))
+        at = jnp.where(founds, jnp.argmin(species.alive), joins)
+        founded = tree.put(species, at, Species(genome, jnp.bool_(True), *blank))
+        return tree.where(founds, founded, species), at
+
+    species, member = jax.lax.scan(place, species, population)
+    return member, eqx.tree_at(lambda s: s.alive, species, sizes(species, member) > 0)
+
+
+def sizes(species: Species, member: Int[Array, " pop"]) -> Int[Array, " species"]:
+    """How many members each species has."""
+    return jnp.zeros(species.alive.shape, jnp.int32).at[member].add(1)
+
+
+def aged(species: Species, member: Int[Array, " pop"], fitness: Fitness) -> Species:
+    """One generation older, with the best fitness of each; -inf counts as the lowest number."""
+    now = jnp.full(species.best.shape, LEAST).at[member].max(jnp.maximum(fitness, LEAST))
+    waited = jnp.where(now > species.best, 0, species.waited + 1)
+    best = (jnp.maximum(now, species.best), waited)
+    return eqx.tree_at(lambda s: (s.best, s.waited), species, best)
+
+
+def shared(
+    species: Species,
+    member: Int[Array, " pop"],
+    fitness: Fitness,
+    allowed: Bool[Array, " species"],
+) -> Float[Array, " species"]:
+    """Explicit fitness sharing (equation 2): the part of the next population that is each species'
+    own, in proportion to the sum of its members' fitness, each divided by their number. `allowed`:
+    which may reproduce."""
+    finite = jnp.isfinite(fitness)
+    lowest = jnp.min(jnp.where(finite, fitness, jnp.inf))
+    raised = jnp.where(finite, fitness - jnp.minimum(lowest, 0.0), 0.0)
+    count = sizes(species, member)
+    adjusted = raised / count[member].astype(jnp.float32)
+    total = jnp.zeros(allowed.shape).at[member].add(adjusted)
+    total = jnp.where(allowed, total, 0.0)
+    # Where nobody has more than the lowest fitness, all have the same part but those without any.
+    played = allowed & (
+        jnp.zeros(allowed.shape, jnp.int32).at[member].max(finite.astype(jnp.int32)) > 0
+    )
+    equal = jnp.where(jnp.any(played), played, allowed).astype(jnp.float32)
+    total = jnp.where(jnp.sum(total) > 0.0, total, equal)
+    return total / jnp.sum(total)
+
+
+def seats(share: Float[Array, " species"], n: int) -> Int[Array, " species"]:
+    """`n` offspring by largest remainder: each species gets the whole part of its due, and those
+    with the largest rest one more. Of equals the first."""
+    due = share * n
+    whole = jnp.floor(due).astype(jnp.int32)
+    rest = jnp.where(share > 0.0, due - jnp.floor(due), -1.0)
+    rank = jnp.argsort(jnp.argsort(-rest, stable=True), stable=True).astype(jnp.int32)
+    return whole + (rank < n - jnp.sum(whole)).astype(jnp.int32)

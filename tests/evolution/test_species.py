@@ -1,0 +1,93 @@
+"""Species of NEAT: membership, sharing and stagnation, worked by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from credo.evolution.genome import Compatibility, Form, first
+from credo.evolution.species import LEAST, Species, aged, seats, shared, sizes, speciate
+from credo.networks.graph import Graph
+
+FORM = Form(1, 1, Graph(hidden=1))
+NEAR = Compatibility(weights=1.0)
+
+
+def genomes(*weights):
+    """One connection each, so that two are as far apart as their weights."""
+    one = first(FORM, 2, key=jax.random.key(0))
+    made = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(weights), *x.shape)), one)
+    weight = made.weight.at[:, 0].set(jnp.asarray(weights, jnp.float32))
+    return jax.tree.map(lambda x: weight if x is made.weight else x, made)
+
+
+def species(room=3):
+    return Species.none(jax.tree.map(lambda x: x[0], genomes(0.0)), room)
+
+
+def test_a_genome_joins_the_first_species_that_is_near_enough():
+    member, after = speciate(NEAR, 1.5, species(), genomes(0.0, 1.0, 2.0, 1.4, 9.0))
+    assert member.tolist() == [0, 0, 1, 0, 2]
+    assert after.alive.tolist() == [True] * 3
+    assert sizes(after, member).tolist() == [3, 1, 1]
+    assert after.representative.weight[:, 0].tolist() == [0.0, 2.0, 9.0]
+
+
+def test_without_room_for_a_species_the_nearest_takes_its_founder():
+    member, after = speciate(NEAR, 1.5, species(2), genomes(0.0, 5.0, 9.0, -3.0))
+    assert member.tolist() == [0, 1, 1, 0]
+    assert after.representative.weight[:, 0].tolist() == [0.0, 5.0]
+
+
+def test_a_species_without_members_gives_its_place_to_the_next():
+    _, before = speciate(NEAR, 1.5, species(), genomes(0.0, 5.0))
+    member, after = speciate(NEAR, 1.5, aged(before, jnp.array([0, 1]), jnp.ones(2)), genomes(5.0))
+    assert member.tolist() == [1]
+    assert after.alive.tolist() == [False, True, False]
+    member, later = speciate(NEAR, 1.5, after, genomes(9.0, 5.0))
+    assert member.tolist() == [0, 1]
+    assert later.best.tolist() == [LEAST, 1.0, LEAST]  # a new one has no past
+
+
+def test_age_is_counted_from_the_last_better_fitness():
+    member = jnp.asarray([0, 0, 1])
+    _, now = speciate(NEAR, 1.5, species(), genomes(0.0, 0.0, 5.0))
+    for fitness in ([1.0, 2.0, 3.0], [2.0, 0.0, 4.0], [1.0, 1.0, 4.0]):
+        now = aged(now, member, jnp.asarray(fitness))
+    assert now.best[:2].tolist() == [2.0, 4.0]
+    assert now.waited[:2].tolist() == [2, 1]
+
+
+def test_offspring_are_shared_by_mean_fitness():
+    """Species of 3 and 1: the sums of adjusted fitness are 2 and 6."""
+    member = jnp.asarray([0, 0, 0, 1])
+    _, now = speciate(NEAR, 1.5, species(), genomes(0.0, 0.0, 0.0, 5.0))
+    share = shared(now, member, jnp.asarray([1.0, 2.0, 3.0, 6.0]), now.alive)
+    np.testing.assert_allclose(share, [0.25, 0.75, 0.0])
+    only = shared(now, member, jnp.asarray([1.0, 2.0, 3.0, 6.0]), jnp.array([True, False, False]))
+    np.testing.assert_allclose(only, [1.0, 0.0, 0.0])
+
+
+def test_fitness_below_zero_is_raised_and_nan_is_the_lowest():
+    member = jnp.asarray([0, 0, 1, 1])
+    _, now = speciate(NEAR, 1.5, species(), genomes(0.0, 0.0, 5.0, 5.0))
+    share = shared(now, member, jnp.asarray([-2.0, 0.0, 1.0, jnp.nan]), now.alive)
+    np.testing.assert_allclose(share, [0.4, 0.6, 0.0])  # raised: 0, 2, 3, 0
+    equal = shared(now, member, jnp.full(4, -7.0), now.alive)
+    np.testing.assert_allclose(equal, [0.5, 0.5, 0.0])
+    one = shared(now, member, jnp.asarray([0.0, 0.0, jnp.nan, jnp.nan]), now.alive)
+    np.testing.assert_allclose(one, [1.0, 0.0, 0.0])
+    nobody = shared(now, member, jnp.full(4, jnp.nan), now.alive)
+    np.testing.assert_allclose(nobody, [0.5, 0.5, 0.0])
+
+
+def test_seats_are_given_by_largest_remainder():
+    assert seats(jnp.asarray([0.5, 0.26, 0.24, 0.0]), 10).tolist() == [5, 3, 2, 0]
+    assert seats(jnp.asarray([0.47, 0.16, 0.158, 0.12, 0.061, 0.031]), 100).tolist() == [
+        47,
+        16,
+        16,
+        12,
+        6,
+        3,
+    ]
+    assert seats(jnp.full(3, 1 / 3), 10).tolist() == [4, 3, 3]
