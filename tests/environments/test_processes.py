@@ -297,4 +297,6 @@ with processes.settled():  # its threads are counted
 @pytest.mark.skipif(not processes.LINUX, reason="no process is bound to a core")
 @pytest.mark.skipif(len(processes.cores()) < 2, reason="there is one core")
 def test_a_settled_process_has_one_core_and_its_children_all():
-    subprocess.run([sys.executable, "-c", SETTLED, f"settled-{os.getpid()}"], check=True)
+    told = [sys.executable, "-c", SETTLED, f"settled-{os.getpid()}"]
+    done = subprocess.run(told, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
