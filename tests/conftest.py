@@ -1,5 +1,6 @@
 import os
 import signal
+import subprocess
 import tempfile
 
 # Tests run one worker per core: one thread each, and programs compiled for speed of compiling.
@@ -31,3 +32,29 @@ def forget_programs():
     """Compiled programs of all modules would fill gigabytes."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def cluster(tmp_path, monkeypatch):
+    """Three nodes on this machine: a head that does nothing, and two with a core each."""
+    pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # or it writes a token into the home
+    monkeypatch.chdir(tmp_path)
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    try:
+        for _ in range(2):
+            made.add_node(num_cpus=1)
+        yield made
+    finally:
+        made.shutdown()
+        assert parent_of_all("raylet") == []
+
+
+def parent_of_all(name):
+    """Processes below this one whose program has a name."""
+    found = subprocess.run(["ps", "-eo", "pid,ppid,comm"], capture_output=True, text=True).stdout
+    lines = [line.split(maxsplit=2) for line in found.splitlines()[1:]]
+    return [int(pid) for pid, parent, comm in lines if comm == name and int(parent) == os.getpid()]

@@ -31,23 +31,9 @@ TRAIN = (
 )
 
 
-@pytest.fixture
-def cluster(tmp_path, monkeypatch):
-    """Three nodes on this machine: a head that plays nothing, and two with a core each."""
-    pytest.importorskip("ray")
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # or it writes a token into the home
+@pytest.fixture(autouse=True)
+def _environments(monkeypatch):
     monkeypatch.syspath_prepend(ENVIRONMENTS)
-    monkeypatch.chdir(tmp_path)
-    from ray.cluster_utils import Cluster
-
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
-    try:
-        for _ in range(2):
-            made.add_node(num_cpus=1)
-        yield made
-    finally:
-        made.shutdown()
 
 
 @pytest.fixture(scope="module")
