@@ -99,7 +99,7 @@ def test_every_member_of_a_family_can_be_made():
     ("words", "expected"),
     [
         ("", "train resume"),
-        ("train", "neuroevolution erl"),
+        ("train", "neuroevolution neat erl"),
         ("train td3", "sequence-classification"),
         ("train td3 x --network", "mmu rnn"),
         ("train td3 x", "--gamma"),
