@@ -125,8 +125,13 @@ def under_way(seed):
 
 
 def both_under_way():
-    """Whether both runs have 50 rows of metrics, and are trained."""
-    return under_way(0) and under_way(1)
+    """Whether both runs have 50 rows of metrics, and are trained. The first that has them waits for
+    the other: a process of Ray may take longer to begin than a run to end."""
+    ready = [under_way(seed) for seed in (0, 1)]
+    for seed in (0, 1):
+        if ready[seed]:
+            os.kill(trainer(seed), signal.SIGCONT if all(ready) else signal.SIGSTOP)
+    return all(ready)
 
 
 def trainer(seed):
