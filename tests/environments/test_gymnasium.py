@@ -18,6 +18,7 @@ TASKS = {
     "credo/SequenceClassification-v0": {"depth": 3, "min_gap": 1, "max_gap": 3},
     "credo/SequenceRecall-v0": {"depth": 2, "min_corridor": 1, "max_corridor": 3},
     "credo/SequenceCopy-v0": {"bits": 2, "max_length": 3},
+    "credo/DoublePole-v0": {"max_steps": 5, "spread": 1.0},
 }
 
 
