@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from ..compilation import jit
 from ..environments.base import correct
@@ -21,6 +21,9 @@ from ..environments.sequence_classification import SequenceClassification
 from ..environments.wrappers import Given
 from ..networks.base import AbstractPolicy
 from ..networks.dmmu import DMMUCarry
+from ..networks.dnc import DNCPolicy
+from ..networks.normalized import Normalized
+from ..networks.ntm import NTMPolicy
 from ..rollout import record
 from ..types import Sequence
 
@@ -47,6 +50,22 @@ def memory_of(carry: Any) -> Float[Array, "cells *batch"]:
             "(output, memory), as an MMU's, or one array"
         )
     return memory
+
+
+def weightings(policy: AbstractPolicy, carries: PyTree) -> dict[str, Float[Any, "moments rows"]]:
+    """How much each head of an NTM or a DNC looks at each row of the memory, moment by moment, by
+    the head's name; of `carries` `[moments, ...]`. Empty for other policies."""
+    inner = policy.policy if isinstance(policy, Normalized) else policy
+    if not isinstance(inner, NTMPolicy | DNCPolicy):
+        return {}
+    _, _, at_read, at_write, *_ = carries
+    found = {}
+    for kind, heads in (("writing head", at_write), ("reading head", at_read)):
+        heads = heads[:, None] if heads.ndim == 2 else heads  # a DNC has one head that writes
+        for i in range(heads.shape[1]):
+            number = f" {i + 1}" if heads.shape[1] > 1 else ""
+            found[kind + number] = heads[:, i]
+    return found
 
 
 def permutations(depth: int) -> Float[np.ndarray, "n depth"]:

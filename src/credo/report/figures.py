@@ -5,7 +5,7 @@ import itertools
 import math
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from html import escape
 from typing import Any, NamedTuple
@@ -25,13 +25,14 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from matplotlib.transforms import offset_copy
 from numpy.typing import NDArray
 
-from .sections import Curve, Figure, HeatMap, Reference, Tracks
-from .styles import DASHES, Look, Theme, assign
+from .sections import Curve, Drawing, Figure, HeatMap, Reference, Tracks
+from .styles import DARK, DASHES, LIGHT, Look, Theme, assign
 from .tables import mean
 
 Floats = NDArray[np.float64]
 Plot = Figure | HeatMap | Tracks
 Looks = Mapping[str, Look]  # of curves, by label
+Paint = Callable[[Canvas, Axes, Theme], None]
 
 WIDTH, HEIGHT = 4.8, 3.1  # inches, without the legend
 LINE = 1.8  # points
@@ -201,6 +202,21 @@ def curve_tips(curve: Curve, figure: Figure) -> dict[str, Any]:
         band = f" [{low:.4g}, {high:.4g}]" if math.isfinite(low) else ""
         texts.append(f"{value:.4g}{band}".replace("-", "−") if math.isfinite(value) else "")
     return {"x": [float(f"{x:.6g}") for x in shown.x[::every]], "text": texts[::every]}
+
+
+def drawing(title: str, label: str, paint: Paint, caption: str, height: float = 2.9) -> Drawing:
+    """A picture in both colourings, `height` inches high; `paint` draws it. `label`: for those who
+    cannot see it."""
+    prefix, made = re.sub(r"\W+", "-", title.lower()), []
+    for name, theme in (("light", LIGHT), ("dark", DARK)):
+        text = io.StringIO()
+        with matplotlib.rc_context(theme.rc):
+            canvas = Canvas(figsize=(WIDTH, height), layout="constrained")
+            FigureCanvasAgg(canvas)
+            paint(canvas, canvas.add_subplot(), theme)
+            canvas.savefig(text, format="svg", transparent=True)
+        made.append(inline(text.getvalue(), label, f"{name}-{prefix}-"))
+    return Drawing(title, made[0], made[1], caption)
 
 
 def inline(svg: str, label: str, prefix: str) -> str:

@@ -17,12 +17,14 @@ from ..algorithms.lineage import MAKERS
 from ..analysis import attribution, bounds
 from ..learners.base import AbstractLearner
 from ..runs import config
+from ..runs.checkpoint import CheckpointError
 from ..runs.names import algorithm_word
 from ..runs.record import RunError
 from ..runs.store import Run
+from . import champions
 from .figures import shortened
 from .pages import write as write_page
-from .sections import Cell, Curve, Figure, Page, Reference, Section, Summary, Table
+from .sections import Cell, Curve, Figure, Page, Reference, Section, Summary, Table, Text
 
 Tree = Mapping[str, Any]  # of a record: an object as `config.to_tree` makes it
 Groups = Mapping[str, list[Run]]  # runs that differ in their seed alone, by label
@@ -73,6 +75,7 @@ def describe(runs: Groups, paths: Sequence[pathlib.Path]) -> Page:
             *_improved(runs),
             _table(runs),
             *_attributions(runs),
+            *_pictures(runs),
             *_settings(runs),
         ],
         facts={
@@ -346,6 +349,17 @@ def learner_names(learners: Sequence[AbstractLearner | Tree]) -> list[str]:
         kind = kind.upper() if learner["class"].startswith("credo.") else kind
         names.append(kind if gamma is None else f"{kind} γ {gamma:g}")
     return numbered(names)
+
+
+def _pictures(runs: Groups) -> list[Section]:
+    """The champion of a page's only run, drawn."""
+    every = [run for group in runs.values() for run in group]
+    if len(every) != 1:
+        return []
+    try:
+        return list(champions.pictures(every[0]))
+    except (CheckpointError, RunError) as error:  # the numbers of its log are shown all the same
+        return [Text("Champion", [f"Not drawn: {error}."])]
 
 
 # ----------------------------------------------------------------------------------------- settings

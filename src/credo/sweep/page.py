@@ -1,23 +1,20 @@
 """The page of a sweep: its best trial, how it got there, what mattered, and every trial."""
 
-import io
 import pathlib
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
-from ..report.figures import WIDTH, add_legend, inline, shorten_ticks, shortened
+from ..report.figures import add_legend, drawing, shorten_ticks, shortened
 from ..report.pages import write as write_page
-from ..report.sections import Cell, Drawing, Page, Section, Table
-from ..report.styles import DARK, LIGHT, Theme
+from ..report.sections import Cell, Page, Section, Table
+from ..report.styles import Theme
 from ..report.tables import number
 from .journal import COMPLETE, FAILED, PRUNED, RUNNING, Journal, Trial, best
 from .plan import Plan
@@ -25,8 +22,6 @@ from .space import Drawn, Range
 
 NAME = "report.html"
 ORDER = (COMPLETE, PRUNED, RUNNING, FAILED)
-HEIGHT = 2.9  # inches
-Paint = Callable[[Canvas, Axes, Theme], None]
 
 
 def write(folder: pathlib.Path, journal: Journal, what: str, seeds: Sequence[int]) -> pathlib.Path:
@@ -148,21 +143,6 @@ def _table(
 # ----------------------------------------------------------------------------------------- drawings
 
 
-def _drawing(title: str, label: str, paint: Paint, caption: str, height: float = HEIGHT) -> Drawing:
-    """A picture in both colourings. `label`: for those who cannot see it."""
-    prefix = title.split()[0].lower()
-    made: list[str] = []
-    for name, theme in (("light", LIGHT), ("dark", DARK)):
-        text = io.StringIO()
-        with matplotlib.rc_context(theme.rc):
-            canvas = Canvas(figsize=(WIDTH, height), layout="constrained")
-            FigureCanvasAgg(canvas)
-            paint(canvas, canvas.add_subplot(), theme)
-            canvas.savefig(text, format="svg", transparent=True)
-        made.append(inline(text.getvalue(), label, f"{name}-{prefix}-"))
-    return Drawing(title, made[0], made[1], caption)
-
-
 def _history(trials: Sequence[Trial], plan: Plan) -> list[Section]:
     """Values of trials in their order, and the best of those that are complete so far."""
     valued = [trial for trial in trials if trial.scores]
@@ -193,7 +173,7 @@ def _history(trials: Sequence[Trial], plan: Plan) -> list[Section]:
         add_legend(canvas, handles)
 
     label = f"values of {len(valued)} trials in their order, and the best so far"
-    return [_drawing("History of the search", label, paint, "")]
+    return [drawing("History of the search", label, paint, "")]
 
 
 def _importance(journal: Journal) -> list[Section]:
@@ -217,7 +197,7 @@ def _importance(journal: Journal) -> list[Section]:
         "of them drew, pruned ones with the value that they had. Of few trials it is a hint."
     )
     height = max(1.2, 0.75 + 0.3 * len(names))
-    return [_drawing("Importance of flags", told, paint, caption, height)]
+    return [drawing("Importance of flags", told, paint, caption, height)]
 
 
 def _coordinates(trials: Sequence[Trial], ranges: Sequence[Range], plan: Plan) -> list[Section]:
@@ -264,7 +244,7 @@ def _coordinates(trials: Sequence[Trial], ranges: Sequence[Range], plan: Plan) -
     label = (
         f"parallel coordinates of {len(complete)} trials over {', '.join(x.name for x in ranges)}"
     )
-    return [_drawing("Parallel coordinates", label, paint, caption, 0.4 + 0.52 * (rows + 1))]
+    return [drawing("Parallel coordinates", label, paint, caption, 0.4 + 0.52 * (rows + 1))]
 
 
 def _axis(axes: Axes, row: int, ticks: Sequence[tuple[float, str]], theme: Theme) -> None:

@@ -1,0 +1,130 @@
+"""What a page draws of a champion: its graph, its heads, its memory."""
+
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from credo.algorithms.neat import NEAT
+from credo.algorithms.neuroevolution import Neuroevolution
+from credo.environments.probes import Remember
+from credo.environments.sequence_copy import SequenceCopy
+from credo.networks.dnc import DNC
+from credo.networks.graph import Graph, GraphPolicy
+from credo.networks.mlp import MLP
+from credo.networks.mmu import MMU
+from credo.networks.ntm import NTM
+from credo.report import champions, run_page
+from credo.report.sections import Drawing, HeatMap, Table
+from credo.runs.loop import train
+from credo.runs.store import Run
+
+QUIET = {"progress": False, "tensorboard": False}
+COPY = SequenceCopy(bits=1, max_length=2)
+
+
+def trained(algorithm, tmp_path):
+    train(algorithm, path=tmp_path / "run", generations=1, **QUIET)
+    return Run(tmp_path / "run")
+
+
+def evolved(network, tmp_path, env=COPY):
+    sizes = {"population_size": 2, "episodes": 1, "test_episodes": 1}
+    return trained(Neuroevolution(env, network, **sizes), tmp_path)
+
+
+def made(weights, outputs, hidden, cells="rnn"):
+    """A network of these connections, `(row, column): weight`, 2 inputs and a bias."""
+    network = Graph(hidden=hidden, cells=cells)
+    matrix = np.zeros((network.sockets(outputs), network.sources(2, outputs)), np.float32)
+    for place, weight in weights.items():
+        matrix[place] = weight
+    return GraphPolicy(jnp.asarray(matrix), outputs, network)
+
+
+def test_the_table_names_every_connection_and_where_it_ends():
+    """Rows: y1, then hidden units; columns: x1, x2, bias, y1, h1, h2."""
+    picture, table = champions.graph(
+        made({(0, 0): 0.5, (1, 1): -2.0, (0, 4): 1.0, (1, 4): 0.25}, 1, 2)
+    )
+    assert table.columns == ["from", "to", "weight"]
+    assert table.rows == [
+        ["x2", "h1", -2.0],
+        ["h1", "y1", 1.0],
+        ["x1", "y1", 0.5],
+        ["h1", "h1", 0.25],
+    ]
+    assert "4 connections, 1 hidden unit" in picture.caption
+    for svg in (picture.light, picture.dark):
+        names = set(re.findall(r"<!-- (\w+) -->", svg)) or set(re.findall(r">([xyh1]\d?)<", svg))
+        assert "h2" not in names  # it has no connection
+
+
+def test_gates_are_named():
+    """Rows of one LSTM cell: y1, block input, input, forget and output gate."""
+    gates = {(0, 4): 1.0, (1, 0): 4.0, (2, 1): 3.0, (3, 2): 2.0, (4, 0): -0.5}
+    _, table = champions.graph(made(gates, 1, 1, "lstm"))
+    assert table.columns == ["from", "to", "ends at", "weight"]
+    assert table.rows == [
+        ["x1", "h1", "block input", 4.0],
+        ["x2", "h1", "input gate", 3.0],
+        ["1", "h1", "forget gate", 2.0],
+        ["h1", "y1", "block input", 1.0],
+        ["x1", "h1", "output gate", -0.5],
+    ]
+
+
+def test_units_stand_in_columns_by_their_distance_from_the_inputs():
+    """x1 → h1 → h2 → y1, and h3, which nothing feeds but itself."""
+    weights = {(1, 0): 1.0, (2, 4): 1.0, (0, 5): 1.0, (3, 6): 1.0, (0, 6): 1.0}
+    policy = made(weights, 1, 3)
+    places = champions.placed(champions.fixed_of(policy), champions.edges_of(policy))
+    assert [places[name][0] for name in ("x1", "h1", "h2", "y1")] == [0, 1 / 3, 2 / 3, 1]
+    assert places["x1"][1] > places["x2"][1] > places["1"][1]
+    assert 0 < places["h3"][0] < 1
+
+
+def test_a_network_without_any_connection_is_drawn():
+    picture, table = champions.graph(made({}, 2, 1))
+    assert table.rows == []
+    assert "0 connections" in picture.caption
+
+
+def test_a_run_of_neat_shows_its_graph_on_the_page(tmp_path):
+    sizes = {"population_size": 4, "episodes": 2, "test_episodes": 2}
+    run = trained(NEAT(Remember(1), Graph(hidden=2), **sizes), tmp_path)
+    sections = run_page.describe({"neat": [run]}, [run.path]).sections
+    assert [type(s) for s in sections if s.title.endswith("champion")] == [Drawing, Table]
+    path = run_page.write([run.path], tmp_path / "report.html")
+    assert "Network of the champion" in path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("network", "titles"),
+    [
+        (NTM("feedforward", 3, 4, 2, read_heads=2), ["writing head", "reading head 1", "2"]),
+        (DNC(hidden=3, rows=4, width=2, read_heads=1), ["writing head", "reading head"]),
+    ],
+)
+def test_heads_are_shown_row_by_row(network, titles, tmp_path):
+    run = evolved(network, tmp_path)
+    maps = list(champions.pictures(run))
+    assert len(maps) == len(titles)
+    for shown, title in zip(maps, titles, strict=True):
+        assert isinstance(shown, HeatMap)
+        assert title in shown.title
+        assert shown.row_labels == ["1", "2", "3", "4"]
+        assert len(shown.column_labels) == np.shape(shown.values)[1] >= 3
+        sums = np.sum(shown.values, axis=0)
+        assert (sums <= 1 + 1e-5).all()
+
+
+def test_memory_cells_are_shown(tmp_path):
+    (shown,) = champions.pictures(evolved(MMU(hidden=3), tmp_path))
+    assert np.shape(shown.values)[0] == 3
+    assert shown.y_label == "memory cell"
+
+
+def test_networks_without_memory_have_no_picture(tmp_path):
+    assert list(champions.pictures(evolved(MLP(hidden=(2,)), tmp_path))) == []
