@@ -107,9 +107,9 @@ def test_mates_are_of_the_same_species_but_for_rare_ones():
     assert set(np.asarray(father).tolist()) == {199, 399}  # the fittest of either
 
 
-def stagnation(waited, best, of_all):
+def stagnation(waited, best, of_all, patience=20):
     """Offspring of three species of equal fitness sums, after so long a wait."""
-    algorithm = dataclasses.replace(ALGORITHM, population_size=21, species=3)
+    algorithm = dataclasses.replace(ALGORITHM, population_size=21, species=3, patience=patience)
     none = Species.none(tree.take(algorithm.init(key=jax.random.key(0)).population, 0), 3)
     species = eqx.tree_at(
         lambda s: (s.alive, s.best, s.waited), none, (jnp.ones(3, bool), best, jnp.asarray(waited))
@@ -132,6 +132,12 @@ def test_a_stagnant_population_goes_on_with_its_best_two_species():
     assert offspring.tolist() == [9, 12, 0]
     assert species.waited.tolist() == [0, 0, 0]
     assert int(waited) == 0
+
+
+def test_without_patience_no_species_but_stagnant_ones_end():
+    offspring, _, _, waited = stagnation([3, 3, 0], jnp.full(3, 5.0), 20, patience=None)
+    assert offspring.tolist() == [7, 9, 5]  # 21 · 2 / 6, 21 · 2.5 / 6 and 21 · 1.5 / 6
+    assert int(waited) == 21
 
 
 def test_a_genome_whose_fitness_is_nan_is_counted_and_never_wins(start):

@@ -7,6 +7,8 @@ Departures from the paper:
 - Of each species the best fifth, and one more, can be parents (`survival`); the paper gives no
   number, and this is what the authors' program does.
 - Crossover is followed by mutation, as in most of what that program does.
+- The whole population is never cut down to its best two species, which the paper does after 20
+  generations without a better fitness (`patience`): on XOR it then stayed where it stood.
 - A mate from another species is the fittest of one drawn at random.
 - What genomes, mutations and species depart in is said in `credo.evolution.genome`, `augment` and
   `species`.
@@ -33,6 +35,7 @@ from ..normalization import Moments, frozen, play
 from ..rollout import Environment, score
 from ..types import Metrics
 from .fitness import objective
+from .infomax import InfoMax
 
 Fitness = Float[Array, " pop"]
 
@@ -46,6 +49,7 @@ class NEATState(eqx.Module):
     innovations: Innovations
     best: Float[Array, ""]  # highest fitness so far
     waited: Int[Array, ""]  # generations since that was reached
+    generation: Int[Array, ""]  # how many there were
     moments: Moments | None  # of all observations; None: they are not normalised
 
 
@@ -66,8 +70,9 @@ class NEAT(eqx.Module):
     survival: float = 0.2  # share of a species that can be parents, its best, in [0, 1]
     dropoff: int = eqx.field(static=True, default=15)
     """Generations without a better fitness after which a species does not reproduce, ≥ 1."""
-    patience: int = eqx.field(static=True, default=20)
-    """The same of the whole population, of which then only the best two species reproduce, ≥ 1."""
+    patience: int | None = eqx.field(static=True, default=None)
+    """The same of the whole population, of which then only the best two species reproduce, ≥ 1; the
+    paper's is 20. None: that never happens."""
     champions: int = eqx.field(static=True, default=5)
     """Members above which a species keeps its fittest unchanged, at least 0."""
     crossover: float = 0.75  # probability that an offspring has two parents, in [0, 1]
@@ -75,6 +80,8 @@ class NEAT(eqx.Module):
     disabled: float = 0.75
     """Probability that a gene which is disabled in either parent is in the offspring, in [0, 1]."""
     mutation: Augmentation = Augmentation()  # how offspring are mutated
+    infomax: InfoMax | None = None
+    """In the first generations the fitness is what memory knows of the input; None: never."""
     fitness: str | None = eqx.field(static=True, default=None)
     """Name of the reward that is the fitness; None: the task's first."""
     score: str | None = eqx.field(static=True, default=None)
@@ -92,8 +99,9 @@ class NEAT(eqx.Module):
                 f"{type(self.env).__name__} has {self.env.agents} agents and NEAT evolves networks "
                 "of one: train neuroevolution, ccea or merl"
             )
-        for name in ("episodes", "test_episodes", "dropoff", "patience"):
+        for name in ("episodes", "test_episodes", "dropoff"):
             require.at_least(name, getattr(self, name), 1)
+        require.at_least("patience", 1 if self.patience is None else self.patience, 1)
         for name in ("population_size", "connections", "species"):
             require.at_least(name, getattr(self, name), 2)
         require.at_least("champions", self.champions, 0)
@@ -101,6 +109,8 @@ class NEAT(eqx.Module):
             require.within(name, getattr(self, name), 0, 1)
         for name in (self.fitness, self.score):
             objective(self.env, name)
+        if self.infomax:
+            self.infomax.check(self.env, self.network)
 
     @classmethod
     def neat(cls, env: Environment, network: Graph | None = None, **overrides) -> Self:
@@ -133,6 +143,11 @@ class NEAT(eqx.Module):
         given = (self.env, networks, self.episodes, state.moments)
         evaluation, moments = play(*given, key=evaluate_key)
         fitness = jnp.mean(evaluation.of(self.fitness or objective(self.env)), axis=1)
+        frames = jnp.sum(evaluation.steps)
+        if self.infomax:  # at first for what it knows of the input
+            given = (self.env, networks, state.generation, fitness)
+            fitness, more = self.infomax(*given, key=jax.random.fold_in(evaluate_key, 1))
+            state, frames = refreshed(self.infomax.generations, state), frames + more
 
         # Genomes join the species whose representative they are compatible with.
         member, species = divided(self, state, fitness)
@@ -152,11 +167,11 @@ class NEAT(eqx.Module):
             "fitness_mean": jnp.nanmean(fitness),
             "fitness_nan": jnp.sum(jnp.isnan(fitness)),
             "champion_score": score(self.env, champion, self.test_episodes, reward, **tested),
-            "frames": jnp.sum(evaluation.steps),
+            "frames": frames,
             **described(state.population, species),
         }
-        after = (bred, champion, species, innovations, best, waited, moments)
-        return NEATState(*after), metrics
+        after = (bred, champion, species, innovations, best, waited, state.generation + 1)
+        return NEATState(*after, moments), metrics
 
 
 @jit
@@ -174,8 +189,26 @@ def begin(neat: NEAT, *, key: PRNGKeyArray) -> NEATState:
         innovations=Innovations(genome.count, jnp.int32(form.fixed)),
         best=jnp.float32(LEAST),
         waited=jnp.int32(0),
+        generation=jnp.int32(0),
         moments=moments,
     )
+
+
+@jit
+def refreshed(start: int, state: NEATState) -> NEATState:
+    """A population whose fitness is another from generation `start` on: what was reached before
+    does not count, and nothing has waited yet."""
+    new, least = state.generation == start, jnp.float32(LEAST)
+    species = eqx.tree_at(
+        lambda s: (s.best, s.waited),
+        state.species,
+        (
+            jnp.where(new, least, state.species.best),
+            jnp.where(new, 0, state.species.waited),
+        ),
+    )
+    reached = (jnp.where(new, least, state.best), jnp.where(new, 0, state.waited))
+    return eqx.tree_at(lambda s: (s.species, s.best, s.waited), state, (species, *reached))
 
 
 @jit
@@ -206,7 +239,7 @@ def apportioned(
     """
     fittest = jnp.maximum(jnp.max(rankable(fitness)), LEAST)
     waited = jnp.where(fittest > state.best, 0, state.waited + 1)
-    refocus = waited > neat.patience
+    refocus = jnp.bool_(False) if neat.patience is None else waited > neat.patience
     now = jnp.full(species.best.shape, -jnp.inf).at[member].max(rankable(fitness))
     rank = jnp.argsort(jnp.argsort(-jnp.where(species.alive, now, -jnp.inf)))
     allowed = jnp.where(refocus, rank < 2, (species.waited < neat.dropoff) | (rank == 0))

@@ -5,8 +5,8 @@ innovation numbers, and the same change in the same generation the same ones.
 
 Departures: a new connection is drawn among all pairs of nodes that have none, where the authors'
 program draws pairs and gives up after some that have one. Connections from the bias are not split:
-the new node would be a constant. The paper gives no size of perturbations and of new weights;
-`strength` and `fresh` solved XOR soonest.
+the new node would be a constant. The paper gives no size of perturbations and of new weights:
+`strength` and `fresh` are one of the pairs by which XOR was solved soon (docs/algorithms/neat.md).
 """
 
 import dataclasses
@@ -29,8 +29,8 @@ class Augmentation(eqx.Module):
     replaced: float = 0.1
     """Probability that one of these weights is replaced by a new one, and not perturbed, in
     [0, 1]."""
-    strength: float = 1.5  # perturbations are uniform between plus and minus this, at least 0
-    fresh: float = 2.0  # new weights are uniform between plus and minus this, at least 0
+    strength: float = 2.5  # perturbations are uniform between plus and minus this, at least 0
+    fresh: float = 4.0  # new weights are uniform between plus and minus this, at least 0
     node: float = 0.03  # probability that a connection is split by a new node, in [0, 1]
     connection: float = 0.05  # probability of a connection between two places without, in [0, 1]
 
