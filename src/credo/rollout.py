@@ -489,6 +489,27 @@ def _answer_these(task: AbstractSequenceTask, members: tuple[PyTree, Sequence]) 
     return Evaluation(returns, jnp.broadcast_to(lengths.T, (pop, lanes[0])))
 
 
+@jit
+def remembered(
+    task: AbstractSequenceTask, population: PyTree, episodes: int, *, key: PRNGKeyArray
+) -> tuple[PyTree, Int[Array, " episodes"]]:
+    """The carries of features-first policies behind the last step of fresh sequences, the same for
+    all: leaves `[features, episodes, pop]`; and the lengths of these."""
+    sequences = jax.vmap(lambda key: task.sample(key=key))(jax.random.split(key, episodes))
+    inputs = jnp.moveaxis(sequences.inputs, 0, -1)[..., None]  # [time, features, episodes, 1]
+    lengths, packed = sequences.length[:, None], pack(population)
+    lanes = (episodes, tree.size(population))
+    start = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (x.shape[0], *lanes)), packed.start(key=None)
+    )
+
+    def body(t, carry):
+        _, later = packed(jnp.broadcast_to(inputs[t], (inputs.shape[1], *lanes)), carry)
+        return jax.tree.map(lambda new, old: jnp.where(t < lengths, new, old), later, carry)
+
+    return jax.lax.fori_loop(0, jnp.max(lengths), body, start), sequences.length
+
+
 def pack(population: PyTree) -> PyTree:
     """Weights `[pop, *shape]` as `[*shape, 1, pop]`: features first, population last."""
     return jax.tree.map(

@@ -39,6 +39,7 @@ from ..normalization import Moments, frozen, play
 from ..rollout import Environment, score
 from ..types import Evaluation, Metrics
 from .fitness import Parsimony, objective
+from .infomax import InfoMax
 
 
 def author_mutation(**fields: Any) -> MatrixMutation:
@@ -65,6 +66,7 @@ class NeuroevolutionState(eqx.Module):
     level: Int[Array, ""]  # of the curriculum
     moments: Moments | None  # of all observations; None: they are not normalised
     breeding: PyTree = None  # what the breeder remembers
+    generation: Int[Array, ""] | None = None  # how many there were; None: it does not matter
 
 
 class Neuroevolution(eqx.Module):
@@ -80,6 +82,8 @@ class Neuroevolution(eqx.Module):
     """Generations over which an elite's fitness is averaged, ≥ 1; after so many the newest counts
     one such part. 1: the last generation alone."""
     curriculum: Curriculum | None = None  # a shorter task at first; None: all of it from the start
+    infomax: InfoMax | None = None
+    """In the first generations the fitness is what memory knows of the input; None: never."""
     parsimony: Parsimony | None = None  # bonus for simple networks, times their score; None: none
     fitness: tuple[str, ...] = eqx.field(static=True, default=(), converter=_names)
     """Names of the rewards whose sum is the fitness; none: the task's first."""
@@ -96,6 +100,13 @@ class Neuroevolution(eqx.Module):
         self.breeder.check(self.population_size, self.network, least=0)
         for name in (*self.fitness, self.score):
             objective(self.env, name)
+        if self.infomax:
+            self.infomax.check(self.env, self.network)
+            if self.elite_memory > 1:
+                raise ValueError(
+                    f"elite_memory is {self.elite_memory} beside infomax, and bits are not "
+                    "averaged with rewards: give elite_memory=1"
+                )
 
     @classmethod
     def as_written(cls, env: Environment, network: AbstractNetwork, **overrides) -> Self:
@@ -169,7 +180,8 @@ class Neuroevolution(eqx.Module):
         moments = Moments.first(self.env, self.network) if self.normalize_observations else None
         champion = frozen(moments, tree.take(population, 0))
         record, age = jnp.zeros(k), jnp.zeros(k, jnp.int32)
-        return NeuroevolutionState(population, champion, record, age, level, moments, breeding)
+        after = (population, champion, record, age, level, moments, breeding)
+        return NeuroevolutionState(*after, jnp.int32(0) if self.infomax else None)
 
     @float32()
     def generation(
@@ -182,7 +194,12 @@ class Neuroevolution(eqx.Module):
 
         # 4-5: for each network, compute fitness.
         evaluation, moments = play(env, population, self.episodes, state.moments, key=evaluate_key)
+        frames = jnp.sum(evaluation.steps)
         fitness, returns = assess(self, state, evaluation)
+        if self.infomax:  # at first for what its memory knows of the input
+            given = (env, population, state.generation, fitness)
+            fitness, more = self.infomax(*given, key=jax.random.fold_in(evaluate_key, 1))
+            frames = frames + more
 
         # 6-12: rank; keep the elites; select, and mutate the selected.
         order = ranking(fitness)
@@ -196,14 +213,15 @@ class Neuroevolution(eqx.Module):
             "fitness_mean": jnp.nanmean(returns),
             "fitness_nan": jnp.sum(jnp.isnan(returns)),
             "champion_score": score(self.env, champion, self.test_episodes, reward, **tested),
-            "frames": jnp.sum(evaluation.steps),
+            "frames": frames,
         }
         level = state.level
         if self.curriculum:
             metrics["level"] = level
             level = self.curriculum.next(level, jnp.mean(evaluation.of(reward)[order[0]]))
-        after = NeuroevolutionState(bred, champion, record, age, level, moments, breeding)
-        return after, metrics
+        elapsed = None if state.generation is None else state.generation + 1
+        after = (bred, champion, record, age, level, moments, breeding, elapsed)
+        return NeuroevolutionState(*after), metrics
 
 
 @jit
