@@ -19,6 +19,7 @@ NAMES = (
     "rollouts",
     "overlap",
     "workers",
+    "neat_generation",
 )
 
 if __name__ == "__main__":
