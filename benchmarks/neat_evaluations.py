@@ -64,7 +64,7 @@ def double_pole() -> tuple[NEAT, Solved]:
         compatibility=Compatibility(weights=3.0),
         threshold=4.0,
         elsewhere=0.05,
-        mutation=Augmentation(connection=0.3),
+        mutation=Augmentation(connection=0.3, strength=1.0, fresh=2.0),
         species=100,
     )
 

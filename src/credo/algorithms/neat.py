@@ -267,10 +267,22 @@ def breed(
     finite = jnp.maximum(rankable(fitness), LEAST)
     lead = jnp.sign(finite[mother] - finite[father])
     keys = jax.random.split(cross_key, neat.population_size)
-    cross = jax.vmap(lambda a, b, x, k: genomes.cross(neat.form, a, b, x, neat.disabled, key=k))
-    born = jax.vmap(tree.where)(mother == father, a, cross(a, b, lead, keys))
+    born = jax.vmap(tree.where)(mother == father, a, crossed(neat, a, b, lead, keys))
     born, innovations = neat.mutation(neat.form, born, state.innovations, key=mutate_key)
     return jax.vmap(tree.where)(kept, a, born), innovations
+
+
+def crossed(neat: NEAT, a: PyTree, b: PyTree, lead: Fitness, keys: PRNGKeyArray) -> PyTree:
+    """A child of each pair of parents."""
+    cross = jax.vmap(lambda a, b, x, k: genomes.cross(neat.form, a, b, x, neat.disabled, key=k))
+    room = a.innovation.shape[1]
+
+    def within(n: int) -> PyTree:
+        children = cross(genomes.shortened(a, n), genomes.shortened(b, n), lead, keys)
+        return genomes.lengthened(children, room)
+
+    used = (jnp.sum(parent.used, axis=1, dtype=jnp.int32) for parent in (a, b))
+    return genomes.by_length(jnp.max(sum(used)), room, within)
 
 
 def parents(

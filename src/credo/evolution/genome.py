@@ -12,13 +12,15 @@ Departures:
   finds none does nothing; a crossover of equals that would need more takes one parent's genes.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from ..networks.graph import Graph, GraphPolicy
 
@@ -121,6 +123,35 @@ def express(form: Form, genome: Genome) -> GraphPolicy:
 
 
 # ------------------------------------------------------------------------- matching up genomes
+
+
+def by_length(needed: Int[Array, ""], room: int, work: Callable[[int], Any]) -> Any:
+    """`work(n)` for the first of some lengths n up to `room` that is at least `needed`: work that
+    grows with the square of the length of genomes, most of which are much shorter than there is
+    room for."""
+    lengths = [n for n in (16, 32, 64, 128, 256) if n < room] + [room]
+    longer = jnp.sum(needed > jnp.array(lengths[:-1], jnp.int32), dtype=jnp.int32)
+    return jax.lax.switch(longer, [partial(work, n) for n in lengths])
+
+
+def shortened(genomes: PyTree, n: int) -> PyTree:
+    """With the first n genes alone, of leaves `[pop, genes]`."""
+    return Genome(genomes.node, *(xs[:, :n] for xs in _genes(genomes)))
+
+
+def lengthened(genomes: PyTree, n: int) -> PyTree:
+    """With room for n genes, of leaves `[pop, genes]`."""
+    more = n - genomes.innovation.shape[1]
+    empty = (NONE, NONE, 0, 0.0, False, NONE)
+    pairs = zip(_genes(genomes), empty, strict=True)
+    return Genome(
+        genomes.node, *(jnp.pad(xs, ((0, 0), (0, more)), constant_values=x) for xs, x in pairs)
+    )
+
+
+def _genes(genomes: PyTree) -> tuple[Array, ...]:
+    parts = (genomes.source, genomes.target, genomes.port, genomes.weight)
+    return (*parts, genomes.enabled, genomes.innovation)
 
 
 def matching(a: Genome, b: Genome) -> tuple[Bool[Array, " genes"], Int[Array, " genes"]]:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .. import tree
-from .genome import Compatibility, Genome
+from .genome import Compatibility, Genome, by_length, shortened
 
 Fitness = Float[Array, " pop"]
 LEAST = np.float32(np.finfo(np.float32).min)  # where there is no fitness yet
@@ -44,20 +44,66 @@ def speciate(
 ) -> tuple[Int[Array, " pop"], Species]:
     """The species of each genome, one after the other: the first whose representative is nearer
     than `threshold`, or a new one, which it represents. Without members a species is no more."""
-    blank = (jnp.float32(LEAST), jnp.int32(0))
-
-    def place(species: Species, genome: Genome) -> tuple[Species, Int[Array, ""]]:
-        away = jax.vmap(lambda other: distance(genome, other))(species.representative)
-        away = jnp.where(species.alive, away, jnp.inf)
-        known, room = jnp.any(away < threshold), ~jnp.all(species.alive)
-        founds = ~known & room
-        joins = jnp.where(known, jnp.argmax(away < threshold), jnp.argmin(away))
-        at = jnp.where(founds, jnp.argmin(species.alive), joins)
-        founded = tree.put(species, at, Species(genome, jnp.bool_(True), *blank))
-        return tree.where(founds, founded, species), at
-
-    species, member = jax.lax.scan(place, species, population)
+    away, founder = by_length(
+        _longest(species.representative, population),
+        population.innovation.shape[1],
+        lambda n: _founded(
+            distance,
+            threshold,
+            shortened(species.representative, n),
+            species.alive,
+            shortened(population, n),
+        ),
+    )
+    near = away < threshold
+    joins = jnp.where(jnp.any(near, axis=1), jnp.argmax(near, axis=1), jnp.argmin(away, axis=1))
+    member, new = joins.astype(jnp.int32), founder >= 0
+    fresh = Species(
+        tree.take(population, jnp.maximum(founder, 0)),
+        new,
+        jnp.full(new.shape, LEAST),
+        jnp.zeros(new.shape, jnp.int32),
+    )
+    species = jax.vmap(tree.where)(new, fresh, species)
     return member, eqx.tree_at(lambda s: s.alive, species, sizes(species, member) > 0)
+
+
+def _longest(*genomes: PyTree) -> Int[Array, ""]:
+    """The most genes that any has."""
+    return jnp.max(jnp.concatenate([jnp.sum(g.used, axis=1, dtype=jnp.int32) for g in genomes]))
+
+
+def _founded(
+    distance: Compatibility,
+    threshold: float,
+    representative: PyTree,
+    alive: Bool[Array, " species"],
+    population: PyTree,
+) -> tuple[Float[Array, "pop species"], Int[Array, " species"]]:
+    """How far each genome is from each species that there is when its turn comes, infinitely from
+    others; and the genome that founds a species, -1: it is an old one, or none."""
+    turn = jnp.arange(population.weight.shape[0], dtype=jnp.int32)
+    from_all = jax.vmap(distance, in_axes=(0, None))
+    away = jax.vmap(lambda one: from_all(population, one), out_axes=1)(representative)
+    away = jnp.where(alive[None], away, jnp.inf)
+
+    def alone(away: Array) -> Bool[Array, " pop"]:
+        return ~jnp.any(away < threshold, axis=1)
+
+    def due(state: tuple[Array, ...]) -> Bool[Array, ""]:
+        alive, away, _ = state
+        return jnp.any(alone(away)) & ~jnp.all(alive)
+
+    def found(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        alive, away, founder = state
+        first, slot = jnp.argmax(alone(away)), jnp.argmin(alive)
+        here = jnp.where(turn >= first, from_all(population, tree.take(population, first)), jnp.inf)
+        founder = founder.at[slot].set(first.astype(jnp.int32))
+        return alive.at[slot].set(True), away.at[:, slot].set(here), founder
+
+    none = jnp.full(alive.shape, -1, jnp.int32)
+    _, away, founder = jax.lax.while_loop(due, found, (alive, away, none))
+    return away, founder
 
 
 def sizes(species: Species, member: Int[Array, " pop"]) -> Int[Array, " species"]:
