@@ -229,6 +229,38 @@ def test_a_cell_has_the_trainer_the_network_and_the_size_of_its_labels():
     assert (len(cell.seeds), cell.generations) == (5, 1000)
 
 
+@pytest.mark.parametrize("name", ["fig-3.4b", "fig-3.9b"])
+def test_neat_plays_as_many_sequences_as_the_networks_beside_it(name):
+    """The published protocol: 100 networks, 10 sequences each, 15,000 generations."""
+    cells = find(name).cells("published")
+    kinds = {(c.labels["trainer"], c.labels["network"], "info-max" in c.labels) for c in cells}
+    assert ("NEAT", "lstm", True) in kinds
+    assert len(kinds) == 4 + 3
+    depths = {c.labels["depth"] for c in cells}
+    assert len(cells) == len(kinds) * len(depths)
+    for cell in cells:
+        algorithm = cell.algorithm
+        first = getattr(algorithm, "infomax", None)
+        more = first.generations * first.episodes if first else 0
+        assert (algorithm.population_size, algorithm.episodes) == (100, 10)
+        assert cell.generations * algorithm.episodes + more == 150_000
+        assert len(cell.seeds) == 3
+
+
+def test_a_cell_of_neat_is_measured_like_the_others(tmp_path):
+    cell = sequences.neat("recall", 1, "lstm", True, 15_000)
+    algorithm = replace(cell.algorithm, env=RECALL, **SIZES)
+    algorithm = replace(algorithm, infomax=replace(algorithm.infomax, generations=2, episodes=8))
+    tiny = replace(cell, algorithm=algorithm, seeds=range(2), generations=12)
+    options = {"tensorboard": False, "progress": False}
+    runs = [
+        train(algorithm, generations=12, seed=seed, path=tmp_path / str(seed), **options)
+        for seed in tiny.seeds
+    ]
+    found = sequences.success(Trained(tiny, runs, "published"))
+    assert len(found) == 2
+
+
 def test_every_network_of_a_fleet_has_the_same_budget():
     cells = fleets.cells("published")
     assert {cell.generations for cell in cells} == {15_000}
