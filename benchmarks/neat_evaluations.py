@@ -7,10 +7,10 @@ XOR: population 150, at most 100 generations; solved when all four answers of on
 right side, as in the authors' program.
 The paper: 4,755 ± 2,553 evaluations, all of 100 runs.
 
-Double pole: population 1,000, at most 100 generations; solved when the champion of a generation
-keeps the poles up for 100,000 steps, and for 1,000 steps from at least 200 of 625 starts, at each
-of which position, velocity, angle of the long pole and its velocity have one of five values. The
-paper: 33,184 evaluations, 20 runs.
+Double pole: population 1,000, at most 100 generations; solved when the champion of a species, one
+in each generation (`chosen`), keeps the poles up for 100,000 steps, and for 1,000 from at least 200
+of 625 starts, at each of which position, velocity, angle of the long pole and its velocity have one
+of five values. The paper: 33,184 evaluations, 20 runs.
 """
 
 import argparse
@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from credo import rollout, tree
-from credo.algorithms.neat import NEAT, NEATState, expressed
+from credo.algorithms.neat import NEAT, NEATState, divided, expressed
 from credo.compilation import jit
 from credo.environments.double_pole import DoublePole
 from credo.environments.probes import Xor
@@ -52,8 +52,8 @@ def xor() -> tuple[NEAT, Solved]:
 
 
 def double_pole() -> tuple[NEAT, Solved]:
-    """The same, with the settings of section 4.1 for a population of 1,000; a solution is the
-    champion."""
+    """The same, with the settings of section 4.1 for a population of 1,000; one champion is tested
+    in each generation."""
     algorithm = NEAT(
         DoublePole(),
         Graph(hidden=20),
@@ -86,13 +86,35 @@ def double_pole() -> tuple[NEAT, Solved]:
 
         return jnp.sum(jax.vmap(stands_from)(starts) >= 1000)
 
-    def solved(_: NEATState, after: NEATState) -> bool:
+    checked = np.full(
+        algorithm.species, -np.inf
+    )  # the best fitness of a species when it was tested
+
+    def solved(before: NEATState, _: NEATState) -> bool:
+        networks = expressed(algorithm, before.population)
+        played = rollout.evaluate(algorithm.env, networks, 1, key=jax.random.key(0))
+        fitness = np.asarray(played.returns["fitness"][:, 0])
+        member = np.asarray(divided(algorithm, before, jnp.asarray(fitness))[0])
+        checked[~np.asarray(before.species.alive)] = -np.inf
+        champion = chosen(fitness, member, checked)
+        one = tree.take(networks, champion)
         for steps in (1000, LONG):
-            if stands(after.champion, DoublePole(max_steps=steps)) < steps:
+            if stands(one, DoublePole(max_steps=steps)) < steps:
                 return False
-        return int(generalises(after.champion)) >= ENOUGH
+        return int(generalises(one)) >= ENOUGH
 
     return algorithm, solved
+
+
+def chosen(fitness: np.ndarray, member: np.ndarray, checked: np.ndarray) -> int:
+    """Whom the authors' program tests: the champion of the best species that has become better
+    since it was tested; if there is none, of the best. Notes in `checked` that it was."""
+    best = np.full(len(checked), -np.inf)
+    np.maximum.at(best, member, fitness)
+    better = np.flatnonzero(best > checked)
+    species = better[np.argmax(best[better])] if len(better) else int(np.argmax(best))
+    checked[species] = best[species]
+    return int(np.argmax(np.where(member == species, fitness, -np.inf)))
 
 
 TASKS = {"xor": xor, "double-pole": double_pole}
