@@ -114,7 +114,7 @@ def test_heads_are_shown_row_by_row(network, titles, tmp_path):
     for shown, title in zip(maps, titles, strict=True):
         assert isinstance(shown, HeatMap)
         assert title in shown.title
-        assert shown.row_labels == ["1", "2", "3", "4"]
+        assert shown.row_labels == ["1", "2", "3", "4"][: len(shown.row_labels)]
         assert len(shown.column_labels) == np.shape(shown.values)[1] >= 3
         sums = np.sum(shown.values, axis=0)
         assert (sums <= 1 + 1e-5).all()
@@ -128,3 +128,15 @@ def test_memory_cells_are_shown(tmp_path):
 
 def test_networks_without_memory_have_no_picture(tmp_path):
     assert list(champions.pictures(evolved(MLP(hidden=(2,)), tmp_path))) == []
+
+
+def test_of_sequences_a_long_one_is_shown_and_empty_rows_are_not(tmp_path):
+    """A memory of which the heads use the first two rows alone."""
+    env = SequenceCopy(bits=1, max_length=6)
+    assert champions._shown(env).max_steps > 10
+    values = np.zeros((9, 5))
+    values[:, 0], values[3, 1], values[4, 2] = 1.0, 0.5, 0.005
+    (shown,) = champions._map("Where it is", values, "row")
+    assert shown.row_labels == ["1", "2"]
+    assert "Nothing reaches 0.01 in the 3 rows" in shown.caption
+    assert list(champions._map("Where it is", values * np.nan, "row")) == []

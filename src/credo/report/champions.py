@@ -14,7 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch
 
 from ..analysis.memory import known_memory, weightings
-from ..environments.base import AbstractEnvironment
+from ..environments.base import AbstractEnvironment, AbstractSequenceTask
+from ..environments.wrappers import Given
 from ..networks.graph import GraphPolicy
 from ..networks.normalized import Normalized
 from ..rollout import record
@@ -25,6 +26,8 @@ from .sections import Drawing, HeatMap, Section, Table
 from .styles import Theme
 
 LONGEST = 120  # moments of an episode that a heat map shows
+FAINT = 0.01  # rows behind the last that reaches this are left out
+DRAWN = 16  # sequences, of which one is shown
 PORTS = ("block input", "input gate", "forget gate", "output gate")
 DASHES: tuple[Any, ...] = ("solid", (0, (5, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 Place = tuple[float, float]
@@ -183,13 +186,23 @@ def _arrow(edge: Edge, places: dict[str, Place], share: float, theme: Theme) -> 
 
 def _memories(env: AbstractEnvironment, policy: Any) -> Iterator[HeatMap]:
     """Heat maps of one episode: the weightings of every head, or the memory cells."""
-    trace = record(env, policy, key=jax.random.key(0))
+    trace = record(_shown(env), policy, key=jax.random.key(0))
     heads = weightings(policy, trace.carries)
     memory = None if heads else known_memory(trace.carries)
     if memory is not None and memory.ndim == 2 and memory.size:
         yield from _map("What the champion remembers", memory, "memory cell")
     for name, rows in heads.items():
         yield from _map(f"Where the champion's {name} is", rows, "row of the memory")
+
+
+def _shown(env: AbstractEnvironment) -> AbstractEnvironment:
+    """The task; of sequences the longest of a few that can be shown whole, if there is one."""
+    if not isinstance(env, AbstractSequenceTask):
+        return env
+    drawn = (env.sample(key=key) for key in jax.random.split(jax.random.key(0), DRAWN))
+    fitting = [sequence for sequence in drawn if int(sequence.length) < LONGEST]
+    longest = max(fitting, key=lambda sequence: int(sequence.length), default=None)
+    return env if longest is None else Given.alone(env, longest)
 
 
 def _map(says: str, values: Any, what: str) -> Iterator[HeatMap]:
@@ -199,6 +212,10 @@ def _map(says: str, values: Any, what: str) -> Iterator[HeatMap]:
     if not np.isfinite(shown).all():
         return
     cut = f" The first {LONGEST} of {moments} moments." if moments > LONGEST else ""
+    used = 1 + int(np.max(np.flatnonzero(np.max(np.abs(shown), axis=1) >= FAINT), initial=0))
+    if used < len(shown):
+        cut += f" Nothing reaches {FAINT:g} in the {len(shown) - used} rows behind the last one."
+        shown = shown[:used]
     yield HeatMap(
         f"{says} in one episode",
         shown,
@@ -206,5 +223,5 @@ def _map(says: str, values: Any, what: str) -> Iterator[HeatMap]:
         [str(i) for i in range(shown.shape[1])],
         "moment",
         what,
-        caption=f"A fresh episode; moment 0 is its start.{cut}",
+        caption=f"A fresh episode, of sequences a long one; moment 0 is its start.{cut}",
     )
