@@ -66,8 +66,11 @@ def on_recall(budget: str) -> list[Cell]:
 
 
 def on_the_deepest(budget: str) -> list[Cell]:
-    """On the deepest task of each kind, our settings by evolution and by gradient."""
-    evolved, networks = ("evolution", True), [(network, None) for network in NETWORKS]
+    """On the deepest task of each kind, our settings by evolution and by gradient; but for smoke
+    also networks with an external memory."""
+    external = () if budget == "smoke" else ("ntm", "dnc")
+    evolved = ("evolution", True)
+    networks = [(network, None) for network in (*NETWORKS, *external)]
     return [
         cell(budget, task, depths[budget][-1], "ours", trainer, network, memory, equal)
         for task, depths in {"classification": DEEPEST, "recall": EVEN}.items()

@@ -31,8 +31,11 @@ from ..algorithms.neuroevolution import Neuroevolution
 from ..analysis import bounds, statistics
 from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
+from ..networks.base import AbstractNetwork
+from ..networks.dnc import DNC
 from ..networks.graph import Graph
 from ..networks.mmu import MMU
+from ..networks.ntm import NTM
 from ..networks.recurrent import Recurrent
 from ..report.rows import Row, Series
 from ..rollout import evaluate
@@ -91,24 +94,34 @@ def cell(
     Our settings have seeds from 200 on, those of the dissertation and its code from 0.
 
     **Arguments:** `task`: classification or recall. `depth`: signals, or turns, of a sequence, at
-    least 1. `preset`: of `PRESETS`. `trainer`: evolution or gradient. `network`: mmu, lstm, gru or
-    rnn, of the size that the task's MMU has. `memory`: cells of an MMU with encoder and decoder
-    learned; None: as many as hidden units. `equal`: evolution ends when the gradient does, at equal
-    reinforcement instances: one is a network times a training sequence (section 3.4), and both use
-    1,000 per generation.
+    least 1. `preset`: of `PRESETS`. `trainer`: evolution or gradient. `network`: mmu, lstm, gru,
+    rnn, ntm or dnc, with as many hidden units as the task's MMU. `memory`: cells of an MMU with
+    encoder and decoder learned; None: as many as hidden units. `equal`: evolution ends when the
+    gradient does, at equal reinforcement instances: one is a network times a training sequence
+    (section 3.4), and both use 1,000 per generation.
     """
     labels = {"task": task, "depth": depth, "preset": preset, "trainer": trainer}
     labels |= {"network": network} | ({"memory": memory} if memory else {})
     labels |= {"at equal instances": True} if equal else {}
     size: dict[str, Any] = {"memory": memory, "encoder": "learned", "decoder": "learned"}
-    mmu = MMU(hidden=HIDDEN[task], **(size if memory else {}))
-    net = mmu if network == "mmu" else Recurrent(cast(Any, network), HIDDEN[task])
+    net = sized(network, HIDDEN[task], **(size if memory else {}))
     algorithm = TRAINERS[trainer][PRESETS.index(preset)](TASKS[task](depth=depth), net)
     few = network != "mmu" or memory or (trainer == "gradient" and preset != "ours")
     first = 200 if preset == "ours" else 0  # our settings were chosen by looking at lower seeds
     seeds = range(first, first + (FEWER if few else RUNS)[budget])
     generations = GENERATIONS[task, "gradient" if equal else trainer][budget]
     return Cell(labels, algorithm, seeds, generations)
+
+
+def sized(network: str, hidden: int, **fields: Any) -> AbstractNetwork:
+    """A network by name, with so many hidden units; NTM and DNC have a memory of 16 rows of 8."""
+    if network == "mmu":
+        return MMU(hidden=hidden, **fields)
+    if network == "ntm":
+        return NTM("feedforward", hidden, rows=16, width=8, start_memory="constant")
+    if network == "dnc":
+        return DNC(hidden=hidden, rows=16, width=8, read_heads=1)
+    return Recurrent(cast(Any, network), hidden)
 
 
 def every(
