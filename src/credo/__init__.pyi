@@ -18,6 +18,7 @@ from .environments.double_pole import DoublePole as DoublePole
 from .environments.extended_tmaze import ExtendedTMaze as ExtendedTMaze
 from .environments.gymnasium import Gymnasium as Gymnasium
 from .environments.host import AbstractHostEnvironment as AbstractHostEnvironment
+from .environments.passive_tmaze import PassiveTMaze as PassiveTMaze
 from .environments.pettingzoo import PettingZoo as PettingZoo
 from .environments.pettingzoo import to_pettingzoo as to_pettingzoo
 from .environments.rover import Rover as Rover

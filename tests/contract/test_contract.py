@@ -11,6 +11,7 @@ import pytest
 from credo import compilation, tree
 from credo.environments.base import AbstractEnvironment
 from credo.environments.double_pole import DoublePole
+from credo.environments.passive_tmaze import PassiveTMaze
 from credo.environments.probes import Copy, Locked, Meet, Remember, Xor
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_copy import RepeatCopy, SequenceCopy
@@ -50,6 +51,7 @@ ENVIRONMENTS = {
     "locked": Locked(size=1, hold=1, max_steps=2),
     "remember": Remember(delay=1),
     "xor": Xor(),
+    "passive tmaze": PassiveTMaze(2),
     "double pole": DoublePole(max_steps=3, spread=1.0),
     "meet": Meet(),
     "delayed": delayed(Meet()),

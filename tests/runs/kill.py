@@ -41,6 +41,9 @@ TRAIN = {
     "--population-size 20 --episodes 5 --network.hidden 3",
     "neat": "neat sequence-classification --depth 3 --min-gap 1 --max-gap 3 "
     "--population-size 20 --episodes 5 --network.hidden 3 --connections 20",
+    "infomax": "neat sequence-classification --depth 3 --min-gap 1 --max-gap 3 --cells lstm "
+    "--population-size 20 --episodes 5 --network.hidden 3 --connections 20 "
+    "--infomax infomax --infomax.generations 5000 --infomax.episodes 10",
     "bptt": "bptt sequence-recall --depth 2 --min-corridor 1 --max-corridor 3 --batch-size 20 "
     "--updates 2 --network.hidden 3 --train-size 100",
     "ccea": "ccea credo.environments.probes:Meet --population-size 6 --breeder.elite-fraction 0.2 "
@@ -67,7 +70,8 @@ TRAIN = {
 }
 GENERATIONS = {  # half of them are enough for seven disturbances
     "neuroevolution": 100_000,
-    "neat": 60_000,
+    "neat": 20_000,
+    "infomax": 15_000,
     "bptt": 20_000,
     "ccea": 60_000,
     "islands": 60_000,

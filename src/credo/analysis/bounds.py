@@ -8,6 +8,7 @@ Sequence Classification where ties are free. Both are in units of the reward tha
 |---|---|---|
 | Sequence Classification, Sequence Recall | `sequences` | counting, exact |
 | Extended T-Maze | `tmaze` | counting, exact |
+| passive T-maze | `corridor` | exact |
 | server fleet | `fleet` | 1,000 episodes of scripted fleets and of an oracle |
 | rovers | `planner` | scripted teams in 50 worlds, and a bound that is proven for each |
 """
@@ -15,17 +16,19 @@ Sequence Classification where ties are free. Both are in units of the reward tha
 from types import ModuleType
 
 from ..environments.extended_tmaze import ExtendedTMaze
+from ..environments.passive_tmaze import PassiveTMaze
 from ..environments.rover import Rover
 from ..environments.sequence_classification import SequenceClassification
 from ..environments.sequence_recall import SequenceRecall
 from ..environments.server_fleet import ServerFleet
 from ..types import Bound
-from . import fleet, planner, sequences, tmaze
+from . import corridor, fleet, planner, sequences, tmaze
 
 EXACT: dict[type, ModuleType] = {
     SequenceClassification: sequences,
     SequenceRecall: sequences,
     ExtendedTMaze: tmaze,
+    PassiveTMaze: corridor,
 }
 """Tasks whose numbers are counted, in seconds at most; those of the others are played."""
 

@@ -33,6 +33,7 @@ TASKS = {
     "credo/SequenceRecall-v0": "credo.environments.sequence_recall:SequenceRecall",
     "credo/SequenceCopy-v0": "credo.environments.sequence_copy:SequenceCopy",
     "credo/RepeatCopy-v0": "credo.environments.sequence_copy:RepeatCopy",
+    "credo/PassiveTMaze-v0": "credo.environments.passive_tmaze:PassiveTMaze",
     "credo/DoublePole-v0": "credo.environments.double_pole:DoublePole",
 }
 
