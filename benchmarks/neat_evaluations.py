@@ -122,7 +122,7 @@ TASKS = {"xor": xor, "double-pole": double_pole}
 
 def evaluations(name: str, seed: int, most: int = 100) -> tuple[int | None, int]:
     """How many networks one run evaluates until one is a solution, None if there is none after
-    `most` generations; and the hidden units of the last champion."""
+    `most` generations; and its generations."""
     algorithm, solved = TASKS[name]()
     state = algorithm.init(key=jax.random.fold_in(jax.random.key(seed), 0))
     for g in range(1, most + 1):
@@ -152,8 +152,8 @@ def main(names: list[str], runs: int, seed: int) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", choices=[*TASKS, []], default=list(TASKS))
+    parser.add_argument("names", nargs="*", choices=[*TASKS, []], default=[])
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=100)
     told = parser.parse_args()
-    main(told.names, told.runs, told.seed)
+    main(told.names or list(TASKS), told.runs, told.seed)

@@ -178,6 +178,10 @@ def test_evolution_for_bits_finds_them():
             lambda: Neuroevolution(TASK, MMU(), infomax=QUICK, elite_memory=3),
             "elite_memory is 3 beside infomax",
         ),
+        (
+            lambda: NEAT(TASK, Graph(), infomax=QUICK, normalize_observations=True),
+            "normalize_observations is True",
+        ),
         (lambda: InfoMax(generations=0), "generations is 0"),
         (lambda: InfoMax(episodes=1), "episodes is 1"),
         (lambda: InfoMax(bins=1), "bins is 1"),

@@ -133,7 +133,7 @@ def test_networks_without_memory_have_no_picture(tmp_path):
 def test_of_sequences_a_long_one_is_shown_and_empty_rows_are_not(tmp_path):
     """A memory of which the heads use the first two rows alone."""
     env = SequenceCopy(bits=1, max_length=6)
-    assert champions._shown(env).max_steps > 10
+    assert int(champions._shown(env).sequences.length[0]) > 10
     values = np.zeros((9, 5))
     values[:, 0], values[3, 1], values[4, 2] = 1.0, 0.5, 0.005
     (shown,) = champions._map("Where it is", values, "row")

@@ -44,12 +44,17 @@ class InfoMax(eqx.Module):
         for name in ("episodes", "bins"):
             require.at_least(name, getattr(self, name), 2)
 
-    def check(self, env: Any, network: AbstractNetwork) -> None:
+    def check(self, env: Any, network: AbstractNetwork, normalized: bool) -> None:
         """Raise `ValueError` if a network's memory cannot be read on this task."""
         if not isinstance(env, AbstractSequenceTask):
             raise ValueError(
                 f"infomax is for labelled sequences, whose inputs no action changes, and "
                 f"{type(env).__name__} has none: train without it"
+            )
+        if normalized:
+            raise ValueError(
+                "infomax sees observations as they are, and normalize_observations is True: give "
+                "one of the two"
             )
         policy = eqx.filter_eval_shape(network.init, *env.sizes, key=jax.random.key(0))
         cells = eqx.filter_eval_shape(lambda p: features(p, p.start(key=None)), policy)

@@ -110,7 +110,7 @@ class NEAT(eqx.Module):
         for name in (self.fitness, self.score):
             objective(self.env, name)
         if self.infomax:
-            self.infomax.check(self.env, self.network)
+            self.infomax.check(self.env, self.network, self.normalize_observations)
 
     @classmethod
     def neat(cls, env: Environment, network: Graph | None = None, **overrides) -> Self:

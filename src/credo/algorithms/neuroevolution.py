@@ -101,7 +101,7 @@ class Neuroevolution(eqx.Module):
         for name in (*self.fitness, self.score):
             objective(self.env, name)
         if self.infomax:
-            self.infomax.check(self.env, self.network)
+            self.infomax.check(self.env, self.network, self.normalize_observations)
             if self.elite_memory > 1:
                 raise ValueError(
                     f"elite_memory is {self.elite_memory} beside infomax, and bits are not "

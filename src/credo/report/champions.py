@@ -25,6 +25,7 @@ from .figures import drawing
 from .sections import Drawing, HeatMap, Section, Table
 from .styles import Theme
 
+MOST = 10_000  # steps of an episode that is played for it
 LONGEST = 120  # moments of an episode that a heat map shows
 FAINT = 0.01  # rows behind the last that reaches this are left out
 DRAWN = 16  # sequences, of which one is shown
@@ -36,14 +37,15 @@ Place = tuple[float, float]
 def pictures(run: Run) -> Iterator[Section]:
     """Of a finished policy what can be shown; nothing of a network that is not Credo's own, or has
     neither a graph nor a memory."""
-    if run.part("network") is None or run.part("env") is None:
+    own = run.config["algorithm"]["class"].startswith("credo.") and "task" in run.config
+    if not own or run.part("network") is None or run.part("env") is None:
         return
     policy = policies.champion(run)
     inner = policy.policy if isinstance(policy, Normalized) else policy
     if isinstance(inner, GraphPolicy):
         yield from graph(inner)
     env = run.part("env")
-    if isinstance(env, AbstractEnvironment):
+    if isinstance(env, AbstractEnvironment) and env.max_steps <= MOST:
         yield from _memories(env, policy)
 
 

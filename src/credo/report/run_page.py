@@ -1,7 +1,7 @@
 """One page about runs: what `credo report` writes.
 
-It reads what runs have recorded: no environment is opened, and no code that a record names is
-imported but Credo's own. So a page about a stranger's run needs no trust in them.
+It reads what runs have recorded: no environment but Credo's own in JAX is played, and no code that
+a record names is imported but Credo's own. So a page about a stranger's run needs no trust in them.
 """
 
 import functools
@@ -17,7 +17,6 @@ from ..algorithms.lineage import MAKERS
 from ..analysis import attribution, bounds
 from ..learners.base import AbstractLearner
 from ..runs import config
-from ..runs.checkpoint import CheckpointError
 from ..runs.names import algorithm_word
 from ..runs.record import RunError
 from ..runs.store import Run
@@ -358,8 +357,8 @@ def _pictures(runs: Groups) -> list[Section]:
         return []
     try:
         return list(champions.pictures(every[0]))
-    except (CheckpointError, RunError) as error:  # the numbers of its log are shown all the same
-        return [Text("Champion", [f"Not drawn: {error}."])]
+    except Exception as error:  # whatever a stranger's file holds, the numbers of its log are shown
+        return [Text("Champion", [f"Not drawn: {str(error).rstrip('.; ')}."])]
 
 
 # ----------------------------------------------------------------------------------------- settings
