@@ -11,7 +11,7 @@ import pytest
 
 from credo import rollout, tree
 from credo.algorithms.infomax import InfoMax, entropy, features, information, stored
-from credo.algorithms.neat import NEAT, refreshed
+from credo.algorithms.neat import NEAT
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
@@ -133,23 +133,32 @@ def test_bits_count_first_and_then_the_task(algorithm):
         assert same == (g >= 2)
         extra = int(metrics["frames"]) - int(task["frames"])
         assert (extra > 0) == (g < 2)
-    assert int(state.generation) == 4
+    phase = state.phase if isinstance(algorithm, NEAT) else state
+    assert int(phase.generation) == 4
 
 
-def test_what_was_reached_in_bits_is_forgotten():
-    algorithm = NEAT(TASK, Graph(hidden=3), connections=9, infomax=QUICK, **SIZES)
+@pytest.mark.parametrize(("given", "ends"), [(3, 3), (3, 2), (3, 5)])
+def test_what_was_reached_in_bits_is_forgotten_whenever_they_end(given, ends):
+    """After 3 generations of bits; a resumed run may have been told another number."""
+    longer = InfoMax(generations=given, episodes=32)
+    algorithm = NEAT(TASK, Graph(hidden=3), connections=9, infomax=longer, **SIZES)
     state = algorithm.init(key=jax.random.key(0))
-    for g in range(2):
+    for g in range(3):
         state, _ = algorithm.generation(state, key=jax.random.fold_in(jax.random.key(1), g))
-    assert int(state.generation) == 2
-    assert float(state.best) > -1e9
-    after = refreshed(2, state)
-    assert float(after.best) < -1e30
-    assert (np.asarray(after.species.best) < -1e30).all()
-    assert (int(after.waited), after.species.waited.max()) == (0, 0)
-    kept = refreshed(3, state)
-    assert float(kept.best) == float(state.best)
-    assert kept.species.best.tolist() == state.species.best.tolist()
+    high = (jnp.float32(99.0), jnp.full_like(state.species.best, 99.0), jnp.int32(7))
+    state = eqx.tree_at(lambda s: (s.best, s.species.best, s.waited), state, high)
+    changed = dataclasses.replace(algorithm, infomax=dataclasses.replace(longer, generations=ends))
+    for g in range(3, 7):
+        state, _ = changed.generation(state, key=jax.random.fold_in(jax.random.key(1), g))
+        rewards = g >= ends
+        assert (float(state.best) < 99.0) == rewards
+        assert (int(state.waited) < 7) == rewards
+        assert bool((state.species.best[state.species.alive] < 99.0).all()) == rewards
+
+
+def test_without_info_max_there_is_no_phase():
+    """So that runs of before have the state that they were saved with."""
+    assert NEAT(TASK, Graph(hidden=3), **SIZES).init(key=jax.random.key(0)).phase is None
 
 
 def test_evolution_for_bits_finds_them():

@@ -40,6 +40,13 @@ from .infomax import InfoMax
 Fitness = Float[Array, " pop"]
 
 
+class Phase(eqx.Module):
+    """How far a run with Info-max is."""
+
+    generation: Int[Array, ""]  # how many there were
+    bits: Bool[Array, ""]  # whether the fitness of the last one was information
+
+
 class NEATState(eqx.Module):
     """What NEAT knows between two generations."""
 
@@ -49,8 +56,8 @@ class NEATState(eqx.Module):
     innovations: Innovations
     best: Float[Array, ""]  # highest fitness so far
     waited: Int[Array, ""]  # generations since that was reached
-    generation: Int[Array, ""]  # how many there were
     moments: Moments | None  # of all observations; None: they are not normalised
+    phase: Phase | None = None  # of Info-max; None: there is none
 
 
 class NEAT(eqx.Module):
@@ -145,9 +152,10 @@ class NEAT(eqx.Module):
         fitness = jnp.mean(evaluation.of(self.fitness or objective(self.env)), axis=1)
         frames = jnp.sum(evaluation.steps)
         if self.infomax:  # at first for what it knows of the input
-            given = (self.env, networks, state.generation, fitness)
+            assert state.phase is not None
+            given = (self.env, networks, state.phase.generation, fitness)
             fitness, more = self.infomax(*given, key=jax.random.fold_in(evaluate_key, 1))
-            state, frames = refreshed(self.infomax.generations, state), frames + more
+            state, frames = refreshed(self, state), frames + more
 
         # Genomes join the species whose representative they are compatible with.
         member, species = divided(self, state, fitness)
@@ -170,8 +178,8 @@ class NEAT(eqx.Module):
             "frames": frames,
             **described(state.population, species),
         }
-        after = (bred, champion, species, innovations, best, waited, state.generation + 1)
-        return NEATState(*after, moments), metrics
+        after = (bred, champion, species, innovations, best, waited, moments, state.phase)
+        return NEATState(*after), metrics
 
 
 @jit
@@ -189,26 +197,27 @@ def begin(neat: NEAT, *, key: PRNGKeyArray) -> NEATState:
         innovations=Innovations(genome.count, jnp.int32(form.fixed)),
         best=jnp.float32(LEAST),
         waited=jnp.int32(0),
-        generation=jnp.int32(0),
         moments=moments,
+        phase=Phase(jnp.int32(0), jnp.bool_(True)) if neat.infomax else None,
     )
 
 
 @jit
-def refreshed(start: int, state: NEATState) -> NEATState:
-    """A population whose fitness is another from generation `start` on: what was reached before
-    does not count, and nothing has waited yet."""
-    new, least = state.generation == start, jnp.float32(LEAST)
-    species = eqx.tree_at(
-        lambda s: (s.best, s.waited),
-        state.species,
-        (
-            jnp.where(new, least, state.species.best),
-            jnp.where(new, 0, state.species.waited),
-        ),
+def refreshed(neat: NEAT, state: NEATState) -> NEATState:
+    """The state of a population whose fitness may be of another kind than a generation before: then
+    what was reached does not count, and nothing has waited yet."""
+    assert neat.infomax is not None
+    assert state.phase is not None
+    bits = state.phase.generation < neat.infomax.generations
+    new = bits != state.phase.bits
+    reached = (state.species.best, state.species.waited, state.best, state.waited)
+    kept = [jnp.where(new, start, x) for start, x in zip((LEAST, 0) * 2, reached, strict=True)]
+    phase = Phase(state.phase.generation + 1, bits)
+    return eqx.tree_at(
+        lambda s: (s.species.best, s.species.waited, s.best, s.waited, s.phase),
+        state,
+        (*kept, phase),
     )
-    reached = (jnp.where(new, least, state.best), jnp.where(new, 0, state.waited))
-    return eqx.tree_at(lambda s: (s.species, s.best, s.waited), state, (species, *reached))
 
 
 @jit
