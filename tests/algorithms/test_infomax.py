@@ -13,6 +13,7 @@ from credo import rollout, tree
 from credo.algorithms.infomax import InfoMax, entropy, features, information, stored
 from credo.algorithms.neat import NEAT
 from credo.algorithms.neuroevolution import Neuroevolution
+from credo.environments.curriculum import Curriculum
 from credo.environments.probes import Copy
 from credo.environments.sequence_classification import SequenceClassification
 from credo.environments.sequence_recall import SequenceRecall
@@ -154,6 +155,21 @@ def test_what_was_reached_in_bits_is_forgotten_whenever_they_end(given, ends):
         assert (float(state.best) < 99.0) == rewards
         assert (int(state.waited) < 7) == rewards
         assert bool((state.species.best[state.species.alive] < 99.0).all()) == rewards
+
+
+def test_a_curriculum_waits_for_the_task_and_a_row_has_one_unit():
+    """One that a network of any kind would pass."""
+    easy = Curriculum(start=1, threshold=0.0)
+    algorithm = Neuroevolution(TASK, MMU(hidden=3), infomax=QUICK, curriculum=easy, **SIZES)
+    state, levels = algorithm.init(key=jax.random.key(0)), []
+    for g in range(4):
+        key = jax.random.fold_in(jax.random.key(1), g)
+        state, metrics = algorithm.generation(state, key=key)
+        levels.append(int(metrics["level"]))
+        assert float(metrics["fitness_mean"]) <= float(metrics["fitness_max"])
+        if g < 2:  # of three cells nobody knows nothing
+            assert float(metrics["fitness_mean"]) > 0.5
+    assert levels == [1, 1, 1, 2]
 
 
 def test_without_info_max_there_is_no_phase():

@@ -64,6 +64,11 @@ class InfoMax(eqx.Module):
                 f"{type(network).__name__} has none that are: take mmu, lstm, gru or rnn, or neat"
             )
 
+    def after(self, generation: Int[Array, ""] | None, then: Array, before: Array) -> Array:
+        """`then` where a generation is behind the first ones, else `before`."""
+        assert generation is not None
+        return jnp.where(generation < self.generations, before, then)
+
     def __call__(
         self,
         env: Any,

@@ -199,7 +199,7 @@ class Neuroevolution(eqx.Module):
         if self.infomax:  # at first for what its memory knows of the input
             given = (env, population, state.generation, fitness)
             fitness, more = self.infomax(*given, key=jax.random.fold_in(evaluate_key, 1))
-            frames = frames + more
+            returns, frames = fitness, frames + more  # nothing of earlier ones is mixed in
 
         # 6-12: rank; keep the elites; select, and mutate the selected.
         order = ranking(fitness)
@@ -218,7 +218,12 @@ class Neuroevolution(eqx.Module):
         level = state.level
         if self.curriculum:
             metrics["level"] = level
-            level = self.curriculum.next(level, jnp.mean(evaluation.of(reward)[order[0]]))
+            later = self.curriculum.next(level, jnp.mean(evaluation.of(reward)[order[0]]))
+            level = (
+                later
+                if self.infomax is None
+                else self.infomax.after(state.generation, later, level)
+            )
         elapsed = None if state.generation is None else state.generation + 1
         after = (bred, champion, record, age, level, moments, breeding, elapsed)
         return NeuroevolutionState(*after), metrics
