@@ -3,8 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from credo.evolution.genome import Compatibility, Form, first
+from credo import tree
+from credo.algorithms.neat import NEAT, crossed
+from credo.environments.probes import Remember
+from credo.evolution.augment import Augmentation
+from credo.evolution.genome import Compatibility, Form, Innovations, first
 from credo.evolution.species import LEAST, Species, aged, seats, shared, sizes, speciate
 from credo.networks.graph import Graph
 
@@ -91,3 +96,67 @@ def test_seats_are_given_by_largest_remainder():
         3,
     ]
     assert seats(jnp.full(3, 1 / 3), 10).tolist() == [4, 3, 3]
+
+
+def grown(steps, key):
+    """Forty genomes of very different lengths."""
+    form = Form.of(Graph(hidden=30), 2, 1)
+    population = jax.vmap(lambda k: first(form, 90, key=k))(jax.random.split(key, 40))
+    innovations = Innovations(jnp.int32(3), jnp.int32(form.fixed))
+    mutate = jax.jit(Augmentation(node=0.3, connection=0.6).__call__, static_argnums=0)
+    for step in range(steps):
+        # Only some go on, so that others stay short.
+        longer, innovations = mutate(
+            form, population, innovations, key=jax.random.fold_in(key, step)
+        )
+        goes_on = jnp.arange(40) % steps >= step
+        population = jax.vmap(tree.where)(goes_on, longer, population)
+    return form, population
+
+
+def one_by_one(distance, threshold, species, population):
+    """The members by the definition: genome after genome, a species after the other."""
+    alive = list(np.asarray(species.alive))
+    known = [tree.take(species.representative, i) for i in range(len(alive))]
+    apart, member = jax.jit(distance.__call__), []
+    for i in range(len(population.weight)):
+        genome = tree.take(population, i)
+        pairs = zip(known, alive, strict=True)
+        away = np.array([apart(genome, x) if there else np.inf for x, there in pairs])
+        if not (away < threshold).any() and not all(alive):
+            at = alive.index(False)
+            alive[at], known[at] = True, genome
+            member.append(at)
+        else:
+            near = away < threshold
+            member.append(int(np.argmax(near) if near.any() else np.argmin(away)))
+    return member
+
+
+@pytest.mark.parametrize("room", [3, 12])
+def test_genomes_of_any_length_find_their_species_as_if_one_came_after_the_other(room):
+    _, population = grown(25, jax.random.key(0))
+    used = np.asarray(population.used).sum(axis=1)
+    assert used.min() < 10
+    assert used.max() > 32
+    distance, threshold = Compatibility(small=1000), 12.0
+    before = Species.none(tree.take(population, 0), room)
+    member, after = speciate(distance, threshold, before, population)
+    assert member.tolist() == one_by_one(distance, threshold, before, population)
+    assert len(set(member.tolist())) >= 3
+    order = jax.random.permutation(jax.random.key(1), 40)
+    mixed = tree.take(population, order)
+    again, _ = speciate(distance, threshold, after, mixed)
+    assert again.tolist() == one_by_one(distance, threshold, after, mixed)
+
+
+def test_a_child_has_all_genes_of_the_fitter_parent_however_long():
+    form, population = grown(25, jax.random.key(2))
+    algorithm = NEAT(Remember(1), form.network)
+    other = jax.tree.map(lambda x: x[::-1], population)
+    keys = jax.random.split(jax.random.key(3), 40)
+    for lead, fitter in ((1.0, population), (-1.0, other)):
+        children = crossed(algorithm, population, other, jnp.full(40, lead), keys)
+        assert children.innovation.tolist() == fitter.innovation.tolist()
+        assert children.node.tolist() == fitter.node.tolist()
+        assert children.source.tolist() == fitter.source.tolist()
