@@ -1,5 +1,6 @@
 """Species of NEAT: membership, sharing and stagnation, worked by hand."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -133,19 +134,22 @@ def one_by_one(distance, threshold, species, population):
     return member
 
 
-@pytest.mark.parametrize("room", [3, 12])
-def test_genomes_of_any_length_find_their_species_as_if_one_came_after_the_other(room):
+@pytest.mark.parametrize(("room", "threshold"), [(3, 12.0), (12, 12.0), (30, 4.0), (60, 1.0)])
+def test_genomes_of_any_length_find_their_species_as_if_one_came_after_the_other(room, threshold):
     _, population = grown(25, jax.random.key(0))
     used = np.asarray(population.used).sum(axis=1)
     assert used.min() < 10
     assert used.max() > 32
-    distance, threshold = Compatibility(small=1000), 12.0
+    distance = Compatibility(small=1000)
     before = Species.none(tree.take(population, 0), room)
     member, after = speciate(distance, threshold, before, population)
     assert member.tolist() == one_by_one(distance, threshold, before, population)
     assert len(set(member.tolist())) >= 3
     order = jax.random.permutation(jax.random.key(1), 40)
     mixed = tree.take(population, order)
+    # Every second species has died, so that new ones have lower numbers than old ones.
+    dead = after.alive & (jnp.arange(room) % 2 == 1)
+    after = eqx.tree_at(lambda s: s.alive, after, dead)
     again, _ = speciate(distance, threshold, after, mixed)
     assert again.tolist() == one_by_one(distance, threshold, after, mixed)
 
