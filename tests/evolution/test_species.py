@@ -10,7 +10,7 @@ from credo import tree
 from credo.algorithms.neat import NEAT, crossed
 from credo.environments.probes import Remember
 from credo.evolution.augment import Augmentation
-from credo.evolution.genome import Compatibility, Form, Innovations, first
+from credo.evolution.genome import NONE, Compatibility, Form, Innovations, first
 from credo.evolution.species import LEAST, Species, aged, seats, shared, sizes, speciate
 from credo.networks.graph import Graph
 
@@ -164,3 +164,23 @@ def test_a_child_has_all_genes_of_the_fitter_parent_however_long():
         assert children.innovation.tolist() == fitter.innovation.tolist()
         assert children.node.tolist() == fitter.node.tolist()
         assert children.source.tolist() == fitter.source.tolist()
+
+
+def test_genes_far_behind_count():
+    """Two genomes of forty genes that differ in the last twenty weights alone."""
+    one = first(Form(20, 2, Graph(hidden=1)), 60, key=jax.random.key(0))
+    other = eqx.tree_at(lambda g: g.weight, one, one.weight.at[20:40].add(8.0))
+    both = jax.tree.map(lambda *xs: jnp.stack(xs), one, other)
+    none = Species.none(one, 3)
+    few = eqx.tree_at(lambda s: s.representative.innovation, none, jnp.full((3, 100), NONE))
+    member, _ = speciate(Compatibility(weights=1.0), 3.0, few, both)
+    assert member.tolist() == [0, 1]
+
+
+def test_a_species_founded_later_is_not_joined_by_who_came_before():
+    """Number 0 is free; the first genome joins number 1, the second founds number 0, which would be
+    near enough to the first as well."""
+    before = species(2)
+    old = tree.put(before, 1, Species(tree.take(genomes(0.0), 0), jnp.bool_(True), LEAST, 0))
+    member, _ = speciate(NEAR, 1.5, old, genomes(1.0, 2.0))
+    assert member.tolist() == [1, 0]
