@@ -328,3 +328,96 @@ def test_the_spread_of_a_reward_counts_what_was_written():
 def test_bad_sampling_is_refused(given, said):
     with pytest.raises(ValueError, match=said):
         Sampling(**given)
+
+
+def episodes_in(ring):
+    """What each slot holds: the number of its episode, and how many steps that had before it."""
+    return np.asarray(ring.data.obs)[: int(ring.size)].astype(int)
+
+
+def told(lengths, memory=True, team=()):
+    """Episodes of these lengths, one behind the other: `obs` says number and step of each row."""
+    where = np.array([(i, t) for i, n in enumerate(lengths) for t in range(n)], np.float32)
+    n, last = len(where), np.cumsum(lengths) - 1
+    over = np.isin(np.arange(n), last)
+    obs = np.broadcast_to(where.reshape(n, *(1,) * len(team), 2), (n, *team, 2))
+    ended = np.broadcast_to(
+        (over & (where[:, 0] % 2 == 0)).reshape(n, *(1,) * len(team)), (n, *team)
+    )
+    return Transition(
+        obs,
+        obs[..., :1],
+        {"a": where[:, 1]},
+        obs + 1,
+        ended,
+        over & (where[:, 0] % 2 == 1),
+        memory=100 + obs if memory else None,
+    )
+
+
+def filled(capacity, *rounds, team=()):
+    one = jax.tree.map(lambda x: jnp.zeros_like(x[0]), told([1], team=team))
+    ring = Replay.empty(one, capacity)
+    for rows in rounds:
+        ring = ring.extend(rows, np.ones(len(rows.terminated), bool))
+    return ring
+
+
+@pytest.mark.parametrize("lengths", [[9], [3, 2, 4], [1, 1, 7], [4, 6, 3, 5], [30]])
+@pytest.mark.parametrize("burn_in", [0, 2])
+def test_windows_stay_in_their_episode(lengths, burn_in):
+    """In a ring of 12: more than that were written in the last two cases."""
+    ring, n, sampling = filled(12, told(lengths)), 500, Sampling(window=4, burn_in=burn_in)
+    draw = jax.jit(lambda key: ring.windows(n, sampling, key=key))
+    rows, windows, counts = draw(jax.random.key(0))
+    length = 4 + burn_in
+    assert rows.memory is None
+    assert (windows.length, windows.burn_in) == (length, burn_in)
+    obs, counts = (np.asarray(x).reshape(n, length, -1) for x in (rows.obs, counts))
+    held, seen = {tuple(x) for x in episodes_in(ring)}, set()
+    for i in range(n):
+        episode, first = obs[i, 0].astype(int)
+        assert (episode, first) in held
+        assert bool(windows.fresh[i]) == (first == 0)
+        np.testing.assert_array_equal(windows.memory[i], 100 + obs[i, 0])
+        for t in range(length):
+            inside = (episode, first + t) in held
+            assert bool(counts[i, t, 0]) == (inside and (first == 0 or t >= burn_in))
+            expected = (episode, first + t) if inside else (0, 0)
+            assert tuple(obs[i, t].astype(int)) == expected
+            if counts[i, t, 0]:
+                seen.add((episode, first + t))
+        assert counts[i].any() or (first > 0 and burn_in)
+    # All that can be told from a burn-in counts somewhere.
+    late = {(e, t) for e, t in held if (e, 0) in held or (e, t - burn_in) in held}
+    assert seen == late
+
+
+def test_windows_of_a_team_are_each_agents_own_or_of_one_moment():
+    ring = filled(40, told([7, 9, 5], team=(2,)), team=(2,))
+    sampling = Sampling(window=4, burn_in=1)
+    for together in (False, True):
+        rows, windows, counts = ring.windows(64, sampling, together=together, key=jax.random.key(0))
+        assert rows.obs.shape == (64 * 5, 2, 2)
+        assert counts.shape == (64 * 5, 2)
+        assert windows.fresh.shape == (64, 2)
+        assert windows.memory.shape == (64, 2, 2)
+        first = np.asarray(rows.obs).reshape(64, 5, 2, 2)[:, 0]
+        np.testing.assert_array_equal(windows.memory, 100 + first)
+        np.testing.assert_array_equal(windows.fresh, first[..., 1] == 0)
+        assert (first[:, 0] == first[:, 1]).all() == together
+
+
+def test_what_stands_behind_an_end_is_not_told():
+    rows = told([3, 4])
+    second = np.where(rows.obs[:, :1] == 1, np.nan, rows.obs)
+    broken = eqx.tree_at(lambda r: r.obs, rows, second)
+    found, *_ = filled(20, broken).windows(50, Sampling(window=3), key=jax.random.key(0))
+    first = np.asarray(found.action).reshape(50, -1)[:, 0] == 0
+    assert np.isfinite(np.asarray(found.obs).reshape(50, -1)[first]).all()
+
+
+def test_windows_need_room():
+    for fields, told_ in (({"window": 0}, "window is 0"), ({"burn_in": -1}, "burn_in is -1")):
+        with pytest.raises(ValueError, match=told_):
+            Sampling(**fields)

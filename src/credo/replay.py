@@ -8,6 +8,7 @@ import contextlib
 import contextvars
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from . import memory, require
 from .compilation import jit
-from .types import Transition
+from .types import Transition, Windows
 
 _filled = contextvars.ContextVar("_filled", default=True)
 SMALL = 2**28  # bytes for which it is not asked whether there is room
@@ -34,9 +35,17 @@ class Sampling(eqx.Module):
     half_life: float | None = None
     """Age at which a transition is drawn half as often as a new one, above 0, in transitions; None:
     all are drawn alike."""
+    window: int = eqx.field(static=True, default=64)
+    """Rows in a row that a network with memory learns from, at least 1; others learn from frames on
+    their own."""
+    burn_in: int = eqx.field(static=True, default=16)
+    """Rows before such a window that refresh a stored memory, unless the episode begins there, at
+    least 0 (Kapturowski et al. 2019, "Recurrent Experience Replay", section 3)."""
 
     def __check_init__(self):
         require.at_least("steps", self.steps, 1)
+        require.at_least("window", self.window, 1)
+        require.at_least("burn_in", self.burn_in, 0)
         if isinstance(self.half_life, int | float) and not self.half_life > 0:
             raise ValueError(f"half_life is {self.half_life}: it must be above 0, or None")
 
@@ -49,6 +58,7 @@ class Sampling(eqx.Module):
 
 UNIFORM = Sampling()
 Sampled = tuple[Transition, Any]  # and the discount behind each, or None
+Windowed = tuple[Transition, Windows, Array]  # and which rows count
 
 
 def _recent(replay: "Replay", half_life: float, u: Array) -> Array:
@@ -117,6 +127,58 @@ class Replay(eqx.Module):
         rows = self._rows(index)
         return (rows, None) if sampling.steps == 1 else self._followed(rows, index, sampling, gamma)
 
+    def windows(self, n: int, sampling=UNIFORM, *, together=False, key) -> Windowed:
+        """`n` windows of `sampling.burn_in + sampling.window` rows, each with a row drawn as by
+        `sample` among those that count. What stands behind the end of an episode is zeros and does
+        not count, nor does the burn-in of a window that begins within an episode.
+
+        **Returns:** the rows, `[n · length, *agents, ...]`, the windows, and which rows count,
+        `[n · length, *agents]`.
+        """
+        length, team = sampling.burn_in + sampling.window, self.data.action.shape[1:-1]
+        row_key, place_key = jax.random.split(key)
+        shape = (n, *(() if together else team))
+        row = sampling.draw(self, shape, key=row_key)
+        place = jax.random.randint(place_key, shape, sampling.burn_in, length)
+        first = (row - jnp.minimum(place, self._before(row, length - 1))) % self.capacity
+        first = jnp.broadcast_to(first.reshape(n, -1), (n, *(team or (1,))))
+        # Of the first row ever nothing was overwritten, so an episode begins there.
+        whole = self.written <= self.capacity
+        fresh = jnp.where(first == self._oldest, whole, self._over(first - 1))
+        steps = jnp.arange(length)[None, :, None]
+        inside = steps <= self._behind(first, length - 1)[:, None]
+        counts = inside & (fresh[:, None] | (steps >= sampling.burn_in))
+        at = ((first[:, None] + steps) % self.capacity).reshape(n * length, -1)
+        inside, counts = (x.reshape(n * length, *team) for x in (inside, counts))
+        if not team:
+            at, first, fresh = at[:, 0], first[:, 0], fresh[:, 0]
+        rows = jax.tree.map(lambda x: _where(inside, x), replace(self._rows(at), memory=None))
+        about = Windows(fresh, self._rows(first).memory, length, sampling.burn_in)  # pyright: ignore
+        return rows, about, counts
+
+    @property
+    def _oldest(self) -> Int[Array, ""]:
+        """The row that will be overwritten first."""
+        return jnp.where(self.written > self.capacity, self.position, 0)
+
+    def _over(self, row: Int[Array, "*any"]) -> Bool[Array, "*any"]:
+        """Whether an episode ends with this row, for all agents."""
+        row = row % self.capacity
+        ended = self.data.terminated[row]
+        return ended.reshape(*row.shape, -1).all(axis=-1) | self.data.truncated[row]
+
+    def _before(self, row: Int[Array, "*any"], most: int) -> Int[Array, "*any"]:
+        """How many rows of the same episode stand before this one; `most` if there are more."""
+        back = row[..., None] - _steps(row, most)
+        goes_on = ~self._over(back - 1) & (back % self.capacity != self._oldest)
+        return jnp.sum(jnp.cumprod(goes_on.astype(jnp.int32), axis=-1), axis=-1)
+
+    def _behind(self, row: Int[Array, "*any"], most: int) -> Int[Array, "*any"]:
+        """How many rows of the same episode stand behind this one; `most` if there are more."""
+        on = row[..., None] + _steps(row, most)
+        goes_on = ~self._over(on) & ((on + 1) % self.capacity != self.position)
+        return jnp.sum(jnp.cumprod(goes_on.astype(jnp.int32), axis=-1), axis=-1)
+
     def _followed(self, rows: Transition, index: Int[Array, "n *agents"], sampling, gamma):
         """Rows that go on for several steps, and the discount behind each."""
         discount = jnp.full(rows.terminated.shape, gamma)
@@ -147,6 +209,17 @@ class Replay(eqx.Module):
         rewards = self.data.rewards[signal]
         each = jnp.mean(jnp.square(rewards).reshape(self.capacity, -1), axis=1)  # 0 where none is
         return jnp.sqrt(jnp.sum(each) / jnp.maximum(self.size, 1).astype(jnp.float32))
+
+
+def _where(inside: Array, x: Array) -> Array:
+    """`x` in these rows, of these agents; zeros elsewhere."""
+    inside = inside.reshape(*inside.shape, *(1,) * (x.ndim - inside.ndim))
+    return jnp.where(inside, x, jnp.zeros_like(x))
+
+
+def _steps(row: Array, most: int) -> Int[Array, "*any most"]:
+    """0 to below `most`, behind the axes of `row`."""
+    return jnp.arange(most, dtype=row.dtype).reshape(*(1,) * row.ndim, most)
 
 
 @contextlib.contextmanager

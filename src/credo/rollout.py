@@ -9,6 +9,7 @@ import dataclasses
 import math
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -22,8 +23,8 @@ from .compilation import float32, jit
 from .environments.base import AbstractEnvironment, AbstractSequenceTask, correct, several
 from .environments.host import AbstractHostEnvironment, EnvironmentFailure, Episodes, sound
 from .environments.wrappers import Given
-from .networks.base import AbstractPolicy
-from .playing import acted, devices, each, players, started, world_keys
+from .networks.base import AbstractNetwork, AbstractPolicy
+from .playing import Record, acted, devices, each, players, started, world_keys
 from .types import Evaluation, Sequence, Trace, Transition, plain
 
 Environment = AbstractEnvironment | AbstractHostEnvironment
@@ -98,14 +99,15 @@ def evaluate(
     and not luck; otherwise each member draws its own.
     """
     if isinstance(env, AbstractHostEnvironment):
-        return _play_on_host(env, population, episodes, episodes, common, False, key=key)[0]
+        return _play_on_host(env, population, episodes, episodes, common, "nothing", key=key)[0]
     packed = getattr(population, "features_first", False)
     if isinstance(env, Given):
         env.require_once(population, episodes)
     if isinstance(env, AbstractSequenceTask) and packed:
         return _answer(env, population, episodes, common, key=key)
     play = _play_in_turn if tree.batch(population) < tree.size(population) else _play
-    return play(env, _lanes(population, episodes, common, key=key), jnp.int32(episodes), False)[0]
+    lanes = _lanes(population, episodes, common, key=key)
+    return play(env, lanes, jnp.int32(episodes), "nothing")[0]
 
 
 @float32()
@@ -117,6 +119,7 @@ def collect(
     wanted=None,
     common=True,
     limit=None,
+    remember=False,
     key,
 ) -> tuple[Evaluation, Experience]:
     """`evaluate`, and every transition that was met. Outside JAX a finished episode costs no more
@@ -124,25 +127,35 @@ def collect(
 
     **Arguments:** of its `episodes` each member plays the first `wanted`, None: all; that number is
     data. The others have no steps and a return of 0. Episodes are truncated after `limit` steps,
-    which is data too; None: when the task ends them.
+    which is data too; None: when the task ends them. `remember`: transitions have the `memory` of
+    policies that have any.
     """
-    wanted = episodes if wanted is None else wanted
+    wanted, record = episodes if wanted is None else wanted, "memory" if remember else "frames"
     if isinstance(env, AbstractHostEnvironment):
-        return _play_on_host(env, population, episodes, wanted, common, True, limit, key=key)
-    return _play(env, _lanes(population, episodes, common, key=key), jnp.int32(wanted), True, limit)
+        return _play_on_host(env, population, episodes, wanted, common, record, limit, key=key)
+    lanes = _lanes(population, episodes, common, key=key)
+    return _play(env, lanes, jnp.int32(wanted), record, limit)
 
 
 @float32()
 def begun(
-    env: Environment, population: PyTree, episodes: int, *, wanted=None, common=True, key
+    env: Environment,
+    population: PyTree,
+    episodes: int,
+    *,
+    wanted=None,
+    common=True,
+    remember=False,
+    key,
 ) -> Callable[[], tuple[Evaluation, Experience]]:
     """`collect` of what is wanted later: call it for the result. Outside JAX nothing is played
     before that, unless `playing.players.start` lets other processes begin."""
     if not isinstance(env, AbstractHostEnvironment):
-        found = collect(env, population, episodes, wanted=wanted, common=common, key=key)
+        how = {"wanted": wanted, "common": common, "remember": remember, "key": key}
+        found = collect(env, population, episodes, **how)
         return lambda: found
-    wanted = episodes if wanted is None else wanted
-    asked = players.ask(_part(env, population, episodes, wanted, common, True, key=key))
+    wanted, record = episodes if wanted is None else wanted, "memory" if remember else "frames"
+    asked = players.ask(_part(env, population, episodes, wanted, common, record, key=key))
     return lambda: _told(asked.result())
 
 
@@ -229,13 +242,14 @@ def _postpone(
 ) -> Float[Array, ""]:
     """The score from before, in the place of one that comes later."""
     assert _TESTS.postponed is not None
-    part = _part(env, tree.single(policy), episodes, episodes, True, False, key=key)
+    part = _part(env, tree.single(policy), episodes, episodes, True, "nothing", key=key)
     _TESTS.postponed.append(Postponed(env, players.ask(part), reward))
     return jnp.float32(before)
 
 
-def blank(env: Environment) -> Transition:
-    """A transition of this task, all zeros: its shapes and types."""
+def blank(env: Environment, network: AbstractNetwork | None = None) -> Transition:
+    """A transition of this task, all zeros: its shapes and types; with the memory of policies of a
+    `network`, where they have any."""
     obs_size, action_size, *team = env.sizes
     obs = jnp.zeros((*team, obs_size), getattr(env, "obs_dtype", "float32"))
     action = jnp.zeros((*team, action_size))
@@ -246,7 +260,19 @@ def blank(env: Environment) -> Transition:
         _, first = jax.eval_shape(lambda: env.reset(key=jax.random.key(0)))
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), first)
         rewards, ended, active = zeros.rewards, zeros.ended, zeros.active
-    return Transition(obs, action, rewards, obs, ended, jnp.bool_(False), active)
+    memory = None if network is None else _memory(network, env.sizes)
+    return Transition(obs, action, rewards, obs, ended, jnp.bool_(False), active, memory)
+
+
+def _memory(network: AbstractNetwork, sizes: tuple[int, ...]) -> Array | None:
+    """What a policy remembers, all zeros; None: nothing."""
+
+    def start():
+        policy = network.init(*sizes, key=jax.random.key(0))
+        return policy.remembered(policy.start(key=jax.random.key(0)))
+
+    shape = jax.eval_shape(start)
+    return None if shape is None else jnp.zeros(shape.shape, shape.dtype)
 
 
 @jit
@@ -274,7 +300,7 @@ def _answer(
 
 @jit
 @devices.shared
-def _play_in_turn(env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: bool):
+def _play_in_turn(env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: Record):
     """Large policies some at a time: their weights stay in the cache from step to step."""
     return tree.in_batches(lambda some: _play(env, some, wanted, record), lanes)
 
@@ -282,12 +308,16 @@ def _play_in_turn(env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""
 @jit
 @devices.shared
 def _play(
-    env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: bool, limit: Any = None
+    env: AbstractEnvironment,
+    lanes: PyTree,
+    wanted: Int[Array, ""],
+    record: Record,
+    limit: Any = None,
 ) -> tuple[Evaluation, Any]:
     """All lanes `[pop, episodes]` take each step together, so that a row of the buffer is written
     in place; a `vmap` of whole episodes would copy the buffer at every step. `lanes`: policies
-    `[pop]`, keys of worlds and of policies. `record`: the second result is the `Experience`, not
-    None."""
+    `[pop]`, keys of worlds and of policies. The second result is the `Experience`; None if nothing
+    is to `record`."""
     population, worlds, policy_keys = lanes
     lanes = worlds.shape
     reset_keys, step_keys = jnp.moveaxis(each(jax.random.split)(worlds), 2, 0)
@@ -299,9 +329,15 @@ def _play(
     lost = active & ~_sound(first.obs)
     totals = (jax.tree.map(jnp.zeros_like, first.rewards), jnp.zeros(lanes, jnp.int32), lost)
     rows: Any = None
-    if record:
+    if record != "nothing":
         row = (blank(env), jnp.bool_(False))
         rows = jax.tree.map(lambda x: jnp.zeros((env.max_steps, *lanes, *x.shape), x.dtype), row)
+        if record == "memory":
+            memory = _remembered(population, carries)
+            empty = (
+                None if memory is None else jnp.zeros((env.max_steps, *memory.shape), memory.dtype)
+            )
+            rows = (replace(rows[0], memory=empty), rows[1])
     start = (jnp.int32(0), states, (first.obs, first.active), carries, active, totals, rows)
 
     def ongoing(loop):
@@ -310,6 +346,7 @@ def _play(
 
     def advance(loop):
         t, states, (obs, acting), carries, active, (returns, steps, lost), rows = loop
+        before = carries
         actions, carries = acted(population, obs, carries)
         sound = _sound(actions)
         actions = jnp.where(jnp.isfinite(actions), actions, 0.0)
@@ -323,8 +360,9 @@ def _play(
         paid = jax.tree.map(lambda x: jnp.where(_over(active, x), x, 0.0), step.rewards)
         returns = jax.tree.map(jnp.add, returns, paid)
         steps = steps + active.astype(jnp.int32)
-        if record:
-            ends = (step.ended, step.truncated, acting)
+        if record != "nothing":
+            memory = _remembered(population, before) if record == "memory" else None
+            ends = (step.ended, step.truncated, acting, memory)
             row = (Transition(obs, actions, step.rewards, step.obs, *ends), active)
             rows = jax.tree.map(lambda xs, x: xs.at[t].set(x), rows, row)
         active = active & ~(step.terminated | step.truncated)
@@ -336,6 +374,13 @@ def _play(
     kept = rows and (rows[0], rows[1] & ~lost[None])
     flat = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2).reshape(-1, *x.shape[3:]), kept)
     return Evaluation(returns, steps), flat and Experience(*flat)
+
+
+def _remembered(population: PyTree, carries: PyTree) -> Array | None:
+    """What the policies of all lanes remember; None: nothing."""
+    if not jax.tree.leaves(carries):
+        return None
+    return eqx.filter_vmap(lambda p, own: jax.vmap(p.remembered)(own))(population, carries)
 
 
 def _sound(x: Array) -> Bool[Array, "pop episodes"]:
@@ -389,7 +434,7 @@ def _record_on_host(
         obs = told.advance(np.asarray(action))
         carries.append(carry)
         see(not told.ongoing)
-    seen, actions, rewards, later, _, truncated, active = told.rows()
+    seen, actions, rewards, later, _, truncated, active, _ = told.rows()
     if not len(seen):
         why = env.copies(1).failure_text(0)
         raise EnvironmentFailure(f"the episode failed, or its policy said NaN: {why}")
@@ -420,7 +465,7 @@ def _part(
     episodes: int,
     wanted: Int[Array, ""] | int,
     common: bool,
-    record: bool,
+    record: Record,
     limit: Any = None,
     *,
     key: PRNGKeyArray,

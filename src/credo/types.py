@@ -81,6 +81,9 @@ class Transition(eqx.Module):
     terminated: Bool[Array, "*rows"]  # the task ended; by agent where agents end on their own
     truncated: Bool[Array, "*rows"]  # the clock ran out
     active: Bool[Array, "*rows agents"] | None = None  # whose action counted; None: everybody's
+    memory: Float[Array, "*rows memory"] | None = None
+    """What the policy remembered before it saw `obs` (`AbstractPolicy.remembered`), of a team by
+    agent; None: it has no memory."""
 
     def followed(self, later: "Transition", where: Any, discount: Any) -> "Transition":
         """Up to the end of a `later` transition, whose rewards are added with a `discount`, in
@@ -95,7 +98,22 @@ class Transition(eqx.Module):
 
         next_obs = last(later.next_obs, self.next_obs)
         ends = (last(later.terminated, self.terminated), last(later.truncated, self.truncated))
-        return Transition(self.obs, self.action, rewards, next_obs, *ends, self.active)
+        return Transition(self.obs, self.action, rewards, next_obs, *ends, self.active, self.memory)
+
+
+class Windows(eqx.Module):
+    """Rows that follow each other in an episode, for networks with memory.
+
+    The rows of a minibatch are then those of the first window in order of time, of the second, and
+    so on: windows times `length` rows.
+    """
+
+    fresh: Bool[Array, "windows *agents"]  # which begin where an episode does
+    memory: Float[Array, "windows *agents memory"]  # what who played remembered at the first row
+    length: int = eqx.field(static=True)  # rows of each window
+    burn_in: int = eqx.field(static=True)
+    """Rows that refresh the memory of a window that is not `fresh`: no gradient flows through
+    them."""
 
 
 class Batch(eqx.Module):
@@ -108,10 +126,16 @@ class Batch(eqx.Module):
     next_obs: Float[Array, "batch obs"]
     terminated: Bool[Array, " batch"]
     truncated: Bool[Array, " batch"]
-    active: Bool[Array, "batch agents"] | None = None
+    active: Bool[Array, "batch *agents"] | None = None
+    """Which rows count: whose action did, and that are no padding; None: all."""
     discount: Float[Array, " batch"] | None = None
     """γ to the number of steps from `obs` to `next_obs`, whose rewards `reward` sums up discounted;
     None: it is one step."""
+    windows: Windows | None = None  # how rows follow each other; None: they are frames on their own
+
+    def observations(self, later: bool = False) -> Float[Array, "batch *agents obs"]:
+        """Those of the rows, or those that follow them."""
+        return self.next_obs if later else self.obs
 
 
 class Trace(eqx.Module):

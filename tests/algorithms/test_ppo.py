@@ -13,6 +13,7 @@ from walk import HostWalk
 from credo.algorithms.ppo import PPO, Actor, Sample, advantages, improve, prepare, surrogate
 from credo.compilation import jit
 from credo.environments.probes import Copy
+from credo.learners.base import act
 from credo.networks.mlp import MLP, Critic
 
 SMALL = {
@@ -45,7 +46,7 @@ def test_advantages_by_hand():
 def test_the_objective_is_clipped_where_that_makes_it_worse(trained):
     ppo, state, _ = trained
     obs, action = jnp.zeros((4, 1)), jnp.array([[0.1], [0.2], [0.3], [0.4]])
-    now = state.actor.log_density(obs, action)
+    now = state.actor.log_density(act(state.actor.mean, obs), action)
     ratio = jnp.array([1.5, 0.5, 1.5, 0.5])
     advantage = jnp.array([1.0, 1.0, -1.0, -1.0])
     value = state.critic(obs.T, jnp.zeros((0, 4)))
@@ -64,7 +65,7 @@ def test_the_density_is_that_of_a_gaussian(trained):
     obs = jnp.array([[0.3]])
     mean = float(actor.mean(obs[0], ())[0][0])
     expected = -0.5 * ((0.7 - mean) / 0.5) ** 2 - np.log(0.5) - 0.5 * np.log(2 * np.pi)
-    density = Actor.log_density(actor, obs, jnp.array([[0.7]]))
+    density = Actor.log_density(actor, act(actor.mean, obs), jnp.array([[0.7]]))
     assert float(density[0]) == pytest.approx(expected, rel=1e-4)
 
 

@@ -13,8 +13,8 @@ import reference
 
 from credo.compilation import jit
 from credo.learners.sac import LOG_STD_MAX, SAC, StochasticActor
+from credo.networks.graph import Graph
 from credo.networks.mlp import MLP, Critic, MLPPolicy
-from credo.networks.recurrent import Recurrent
 from credo.types import Batch
 
 OBS, ACT, N = 2, 2, 5
@@ -37,7 +37,9 @@ def update(learner, state, batch, key):
 
 @jit
 def sample(actor, obs, key):
-    return actor.sample(obs, key=key)
+    """Of observations `[obs, batch]`."""
+    batch = Batch(obs.T, *[None] * 5)  # pyright: ignore[reportArgumentType]
+    return actor.sample(batch, key=key)
 
 
 def batch_of(seed):
@@ -228,12 +230,18 @@ def test_each_step_draws_anew(start):
     assert len(set(actions)) == 3
 
 
-@pytest.mark.parametrize(
-    "network", [Recurrent(cell="gru", hidden=2), MLP(hidden=(2,), output_activation="sigmoid")]
-)
-def test_networks_without_a_mean_to_squash_are_refused(network):
-    with pytest.raises(TypeError, match="SAC needs an MLP with a tanh output"):
-        SAC().init(network, OBS, ACT, key=jax.random.key(0))
+def test_networks_without_a_mean_to_squash_are_refused():
+    with pytest.raises(TypeError, match="SAC draws actions around.*Graph.*give MLP.*TD3"):
+        SAC().init(Graph(hidden=2), OBS, ACT, key=jax.random.key(0))
+
+
+def test_a_sigmoid_is_half_as_steep_as_tanh():
+    network = MLP(hidden=(2,), output_activation="sigmoid")
+    actor = SAC().init(network, OBS, ACT, key=jax.random.key(0)).actor
+    silent = eqx.tree_at(lambda a: a.head["b_0"], actor, jnp.full(ACT, -20.0))
+    obs = jnp.ones((OBS, 1))
+    action, _ = sample(silent, obs, jax.random.key(0))
+    np.testing.assert_allclose(action[:, 0], actor.mean(obs[:, 0], ())[0], atol=1e-3)
 
 
 def test_a_reward_scale_is_that_of_the_rewards(start):

@@ -15,7 +15,6 @@ from credo.learners.td3 import TD3, ddpg
 from credo.networks.base import AbstractPolicy
 from credo.networks.exploration import GaussianNoise, OrnsteinUhlenbeck
 from credo.networks.mlp import MLP, Critic
-from credo.networks.recurrent import Recurrent
 from credo.types import Batch
 
 OBS, ACT, N = 2, 1, 6
@@ -266,11 +265,6 @@ def test_ddpg_has_the_constants_of_section_5_4():
     assert (learner.critic.branches, learner.critic.hidden) == ((200, 200), (300,))
     assert ddpg().gamma == TD3().gamma == 0.99
     assert TD3().noise == GaussianNoise(0.1)
-
-
-def test_a_network_with_memory_is_refused():
-    with pytest.raises(TypeError, match=r"Recurrent has memory.*feed-forward.*MLP"):
-        TD3().init(Recurrent(cell="gru", hidden=2), OBS, ACT, key=jax.random.key(0))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from credo.learners.base import learn
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3, ddpg, maddpg, matd3
 from credo.networks.mlp import MLP, Critic
-from credo.networks.mmu import MMU
 from credo.networks.team import JointCritic, Team
 from credo.replay import Replay
 from credo.types import Batch, Transition
@@ -391,11 +390,6 @@ def test_the_actor_of_a_team_may_start_small():
         for name in ("W_0", "b_0"):
             np.testing.assert_allclose(b.weights[name], 0.1 * a.weights[name], rtol=1e-6)
     assert same(small.actor, small.target_actor)
-
-
-def test_teams_with_memory_are_refused():
-    with pytest.raises(TypeError, match=r"Team has memory.*feed-forward"):
-        TD3().init(Team(head=MMU(hidden=2)), OBS, ACT, AGENTS, key=jax.random.key(0))
 
 
 def test_ddpg_learns_for_a_team_too():

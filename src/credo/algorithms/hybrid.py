@@ -106,6 +106,11 @@ class Hybrid(eqx.Module):
             self.coach.check(self.population_size, self.elites, self.learners)
         if self.surrogate is not None:
             self.surrogate.check(self.breeder, self.learners)
+        if self.horizon is not None and self.network.remembers:
+            raise ValueError(
+                "a horizon asks the critic about the last step alone, and "
+                f"{type(self.network).__name__} has memory: give horizon=None"
+            )
         if self.horizon is not None:
             self.horizon.check(self.reward, self.redistribute, self.learners)
         if self.overlap and (not q or self.share is not None or self.horizon is not None):
@@ -153,7 +158,7 @@ class Hybrid(eqx.Module):
             population=population,
             lineage=Lineage.first(k, q),
             learners=tuple(one.init(network, *env.sizes, key=key) for one, key in pairs),
-            replay=Replay.empty(blank(env), self.replay_capacity) if q else None,
+            replay=Replay.empty(blank(env, network), self.replay_capacity) if q else None,
             ledger=Ledger.empty(q),
             allocation=even(self.workers, max(q, 1)),
             champion=frozen(moments, tree.take(population, 0)),
@@ -201,6 +206,7 @@ def play(hybrid: Hybrid, state: HybridState, policies, episodes: int, **how) -> 
     All of a generation act by the moments of those before; learners learn by those with what was
     `seen` since.
     """
+    how |= {"remember": state.replay is not None}
     played, new = collect(hybrid.env, behind(state.moments, policies), episodes, **how)
     return stored(hybrid, state, played, new), played
 

@@ -132,7 +132,7 @@ class OffPolicy(eqx.Module):
         moments = Moments.first(env, self.network) if self.normalize_observations else None
         return OffPolicyState(
             learner=learner,
-            replay=Replay.empty(blank(env), self.replay_capacity),
+            replay=Replay.empty(blank(env, self.network), self.replay_capacity),
             champion=frozen(moments, self.learner.actor(learner)),
             score=jnp.float32(-jnp.inf),
             frames=jnp.int32(0),
@@ -163,7 +163,7 @@ class OffPolicy(eqx.Module):
         explorer = tree.single(
             self.learner.explorer(state.learner, state.frames < self.start_frames)
         )
-        how = {"common": False, "key": explore_key}
+        how = {"common": False, "remember": True, "key": explore_key}
         explorer = behind(state.moments, explorer)
         played, experience = collect(self.env, explorer, self.episodes, **how)
         moments = watched(state.moments, experience)

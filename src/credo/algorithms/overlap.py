@@ -9,6 +9,7 @@ run's record, and the result depends on no clock.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -32,9 +33,11 @@ def overlapped(
     play_key, explore_key, learn_key = keys
     state = replace(state, moments=state.seen)
     acting = behind(state.moments, state.population)
-    population, asked = begun(hybrid.env, acting, hybrid.episodes, key=play_key), []
+    how: Any = {"remember": True}
+    population, asked = begun(hybrid.env, acting, hybrid.episodes, **how, key=play_key), []
     for i in range(len(hybrid.learners)):
-        team, how = exploring(hybrid, state, i, key=explore_key)
+        team, theirs = exploring(hybrid, state, i, key=explore_key)
+        how |= theirs
         team = behind(state.moments, team)
         asked.append((how["wanted"], begun(hybrid.env, team, hybrid.workers, **how)))
     players.start()

@@ -20,10 +20,11 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .. import require, tree
 from ..compilation import float32, jit
-from ..learners.base import act, adam, adam_state, averaged, require_memoryless
+from ..learners.base import act, adam, adam_state, averaged, mean
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import Explorer, GaussianNoise
-from ..networks.mlp import MLP, Critic, CriticNetwork
+from ..networks.history import HistoryCriticNetwork, remembering, through
+from ..networks.mlp import MLP, AbstractCriticNetwork, Critic
 from ..normalization import Moments, behind, frozen, seen, warmed, watched
 from ..replay import Replay, extend
 from ..rollout import Environment, blank, collect
@@ -38,14 +39,14 @@ class Actor(eqx.Module):
     log_std: Float[Array, " act"]
 
     def log_density(
-        self, obs: Float[Array, "batch obs"], action: Float[Array, "batch act"]
+        self, mean: Float[Array, "batch act"], action: Float[Array, "batch act"]
     ) -> Float[Array, " batch"]:
-        z = (action - act(self.mean, obs)) / jnp.exp(self.log_std)[None]
+        z = (action - mean) / jnp.exp(self.log_std)[None]
         each = -0.5 * jnp.square(z) - self.log_std[None] - 0.5 * jnp.log(2.0 * jnp.pi)
         return jnp.sum(each, axis=1)
 
 
-Networks = tuple[Actor, CriticNetwork]
+Networks = tuple[Actor, AbstractCriticNetwork]
 
 
 class Sample(eqx.Module):
@@ -56,13 +57,18 @@ class Sample(eqx.Module):
     log_density: Float[Array, " rows"]  # of the action when it was drawn
     advantage: Float[Array, " rows"]
     value: Float[Array, " rows"]  # what the critic should have said
+    counts: Bool[Array, " rows"] | None = None  # which are frames; None: all
+    begins: Bool[Array, " rows"] | None = None
+    """Of networks with memory: where an episode begins; and what they remembered before each row.
+    """
+    memories: tuple[Float[Array, "rows memory"], Float[Array, "rows memory"]] | None = None
 
 
 class PPOState(eqx.Module):
     """What PPO knows between two generations."""
 
     actor: Actor
-    critic: CriticNetwork
+    critic: AbstractCriticNetwork
     optimizer: optax.OptState
     replay: Replay  # the frames of one generation
     champion: AbstractPolicy
@@ -87,6 +93,8 @@ class PPO(eqx.Module):
     copies: int = eqx.field(static=True, default=32)  # episodes between rounds, at most; ≥ 1
     epochs: int = eqx.field(static=True, default=10)  # passes over these frames, at least 1
     batch_size: int = eqx.field(static=True, default=64)  # frames per update, at least 1
+    window: int = eqx.field(static=True, default=64)
+    """Frames in a row through which a network with memory is followed back, at least 1."""
     gamma: float = 0.99  # γ: discount per step, in [0, 1]
     gae: float = 0.95  # λ of generalized advantages, in [0, 1]
     clip: float = 0.2  # ε: how far from 1 a probability ratio counts, at least 0
@@ -104,7 +112,8 @@ class PPO(eqx.Module):
 
     def __check_init__(self):
         require.fits(self.env, self.network, self)
-        for name in ("horizon", "copies", "epochs", "batch_size", "test_episodes", "test_every"):
+        counts = ("horizon", "copies", "epochs", "batch_size", "window")
+        for name in (*counts, "test_episodes", "test_every"):
             require.at_least(name, getattr(self, name), 1)
         for name in ("gamma", "gae"):
             require.within(name, getattr(self, name), 0, 1)
@@ -130,9 +139,9 @@ class PPO(eqx.Module):
         require.continuous(env, self)
         actor_key, critic_key = jax.random.split(key)
         mean = self.network.init(env.obs_size, env.action_size, key=actor_key)
-        require_memoryless(self.network, mean)
         actor = Actor(mean, jnp.full(env.action_size, jnp.log(self.first_std)))
-        critic = self.critic.init(env.obs_size, 0, key=critic_key)  # a value of states
+        values = remembering(self.critic) if self.network.remembers else self.critic
+        critic = values.init(env.obs_size, 0, key=critic_key)  # a value of states
         # Room for a round of episodes that are all much longer than the last ones.
         most = min(self.copies * env.max_steps, self.horizon + 8 * env.max_steps)
         moments = Moments.first(env, self.network) if self.normalize_observations else None
@@ -204,21 +213,24 @@ def improve(
     moments: Any = None,
     *,
     key: Any,
-) -> tuple[Actor, CriticNetwork, optax.OptState, Metrics]:
+) -> tuple[Actor, AbstractCriticNetwork, optax.OptState, Metrics]:
     """K epochs of minibatches of M frames. How many frames there are is data."""
     sample = prepare(ppo, networks, replay, moments)
-    batches = replay.size // ppo.batch_size
+    together = ppo.window if sample.begins is not None else 1  # rows that stay together
+    pieces, some = -(-replay.capacity // together), max(ppo.batch_size // together, 1)
+    ready = -(-replay.size // together)
+    batches = ready // some
     weights, static = eqx.partition(networks, eqx.is_inexact_array)
 
     def epoch(k, loop):
         # A permutation of the frames, in minibatches; what is left over is left out.
-        u = jax.random.uniform(jax.random.fold_in(key, k), (replay.capacity,))
-        order = jnp.argsort(jnp.where(jnp.arange(replay.capacity) < replay.size, u, 2.0))
+        u = jax.random.uniform(jax.random.fold_in(key, k), (pieces,))
+        order = jnp.argsort(jnp.where(jnp.arange(pieces) < ready, u, 2.0))
 
         def step(i, loop):
             weights, opt, total = loop
-            index = jax.lax.dynamic_slice_in_dim(order, i * ppo.batch_size, ppo.batch_size)
-            rows = jax.tree.map(lambda x: x[index], sample)
+            index = jax.lax.dynamic_slice_in_dim(order, i * some, some)
+            rows = _rows(sample, index, together)
             (_, metrics), gradient = jax.value_and_grad(
                 lambda w: surrogate(ppo, eqx.combine(w, static), rows), has_aux=True
             )(weights)
@@ -241,20 +253,28 @@ def prepare(ppo: PPO, networks: Networks, replay: Replay, moments: Moments | Non
     filled = jnp.arange(replay.capacity) < replay.size
     reward = rows.rewards[objective(ppo.env, ppo.signal)]
     obs, next_obs = seen(moments, rows.obs), seen(moments, rows.next_obs)
-    value, after = _value(critic, obs), _value(critic, next_obs)
+    over = rows.terminated | rows.truncated
+    before: Any = {}
+    if jax.tree.leaves(jax.eval_shape(lambda: actor.mean.start(key=jax.random.key(0)))):
+        begins = jnp.append(True, over[:-1])
+        means, value, after, memories = _told_in_order(networks, obs, next_obs, begins)
+        before = {"counts": filled, "begins": begins, "memories": memories}
+    else:
+        means, value, after = act(actor.mean, obs), _value(critic, obs), _value(critic, next_obs)
     delta = reward + ppo.gamma * jnp.where(rows.terminated, 0.0, after) - value
     # Rows come episode by episode.
-    goes_on = ~(rows.terminated | rows.truncated) & jnp.append(filled[1:], False)
+    goes_on = ~over & jnp.append(filled[1:], False)
     advantage = advantages(delta, goes_on, ppo.gamma * ppo.gae)
     n = jnp.maximum(replay.size, 1).astype(jnp.float32)
-    mean = jnp.sum(jnp.where(filled, advantage, 0.0)) / n
-    variance = jnp.sum(jnp.where(filled, jnp.square(advantage - mean), 0.0)) / n
+    average = jnp.sum(jnp.where(filled, advantage, 0.0)) / n
+    variance = jnp.sum(jnp.where(filled, jnp.square(advantage - average), 0.0)) / n
     return Sample(
         obs,
         rows.action,
-        actor.log_density(obs, rows.action),
-        (advantage - mean) / (jnp.sqrt(variance) + 1e-8),
+        actor.log_density(means, rows.action),
+        (advantage - average) / (jnp.sqrt(variance) + 1e-8),
         advantage + value,
+        **before,
     )
 
 
@@ -274,14 +294,78 @@ def advantages(
 def surrogate(ppo: PPO, networks: Networks, rows: Sample) -> tuple[Float[Array, ""], Metrics]:
     """Minus the clipped objective (equation 7) and the critic's squared error."""
     actor, critic = networks
-    ratio = jnp.exp(actor.log_density(rows.obs, rows.action) - rows.log_density)
+    if rows.memories is None:
+        means, value = act(actor.mean, rows.obs), _value(critic, rows.obs)
+    else:
+        means, value = _told_in_windows(ppo, networks, rows)
+    ratio = jnp.exp(actor.log_density(means, rows.action) - rows.log_density)
     bounded = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
-    policy_loss = -jnp.mean(jnp.minimum(ratio * rows.advantage, bounded * rows.advantage))
-    critic_loss = jnp.mean(jnp.square(_value(critic, rows.obs) - rows.value))
-    clipped = jnp.mean((ratio != bounded).astype(jnp.float32))
+    gain = jnp.minimum(ratio * rows.advantage, bounded * rows.advantage)
+    policy_loss = -mean(gain, rows.counts)
+    critic_loss = mean(jnp.square(value - rows.value), rows.counts)
+    clipped = mean((ratio != bounded).astype(jnp.float32), rows.counts)
     metrics = {"policy_loss": policy_loss, "critic_loss": critic_loss, "clipped": clipped}
     return policy_loss + ppo.value_weight * critic_loss, metrics
 
 
-def _value(critic: CriticNetwork, obs: Float[Array, "rows obs"]) -> Float[Array, " rows"]:
+def _rows(sample: Sample, pieces: Int[Array, " some"], together: int) -> Sample:
+    """The rows of some pieces, each of so many that follow one another; those behind the last frame
+    do not count."""
+    if together == 1:
+        return jax.tree.map(lambda x: x[pieces], sample)
+    index = (pieces[:, None] * together + jnp.arange(together)[None]).reshape(-1)
+    rows = jax.tree.map(lambda x: x[jnp.minimum(index, len(x) - 1)], sample)
+    return replace(rows, counts=rows.counts & (index < len(sample.value)))
+
+
+def _told_in_order(networks: Networks, obs: Array, next_obs: Array, begins: Array):
+    """What networks with memory say of all frames, one after the other.
+
+    **Returns:** the actor's actions, the critic's values of each frame and of what follows it, and
+    what both remembered before each.
+    """
+    actor, critic = networks[0], _with_history(networks[1])
+    means, remembered = through(actor.mean, obs, begins)
+
+    def ahead(policy):
+        def step(given, carry):
+            told, carry = policy(given[0], carry)
+            return (told, policy(given[1], carry)[0]), carry
+
+        return step
+
+    told, known = through(critic.memory, (obs, next_obs), begins, said=ahead)
+    values = [_value_of(critic, *pair) for pair in zip(told, (obs, next_obs), strict=True)]
+    return means, *values, (remembered, known)
+
+
+def _told_in_windows(ppo: PPO, networks: Networks, rows: Sample):
+    """The actor's actions and the critic's values of windows, from what was remembered at their
+    first rows."""
+    actor, critic = networks[0], _with_history(networks[1])
+    assert rows.memories is not None
+
+    def split(x):
+        return x.reshape(-1, ppo.window, *x.shape[1:])
+
+    def follow(policy, memory):
+        told = jax.vmap(lambda *given: through(policy, *given)[0])
+        told = told(split(rows.obs), split(rows.begins), split(memory)[:, 0])
+        return told.reshape(-1, told.shape[-1])
+
+    means = follow(actor.mean, rows.memories[0])
+    return means, _value_of(critic, follow(critic.memory, rows.memories[1]), rows.obs)
+
+
+def _with_history(critic: AbstractCriticNetwork) -> HistoryCriticNetwork:
+    assert isinstance(critic, HistoryCriticNetwork)
+    return critic
+
+
+def _value_of(critic: HistoryCriticNetwork, told: Array, obs: Array) -> Float[Array, " rows"]:
+    """By what the critic's memory told it, and what is seen now."""
+    return _value(critic.critic, jnp.concatenate([told, obs], axis=1))
+
+
+def _value(critic: AbstractCriticNetwork, obs: Float[Array, "rows obs"]) -> Float[Array, " rows"]:
     return critic(obs.T, jnp.zeros((0, obs.shape[0])))

@@ -227,8 +227,13 @@ class Episodes:
         self.ongoing = True
         return self._obs
 
-    def advance(self, actions: Float[np.ndarray, "n *agents act"]) -> np.ndarray:
-        """One step of the turn: the next observations."""
+    def advance(
+        self,
+        actions: Float[np.ndarray, "n *agents act"],
+        memory: Float[np.ndarray, "n *agents memory"] | None = None,
+    ) -> np.ndarray:
+        """One step of the turn: the next observations. `memory`: what policies remembered before
+        it, if that is to be recorded."""
         active, finite = self.active, np.isfinite(actions)
         if not finite.all():
             self._lost |= active & ~finite.reshape(active.size, -1).all(axis=1)
@@ -245,7 +250,7 @@ class Episodes:
         if self._least <= self._done < self._env.max_steps:
             over = over | ((self._limits <= self._done) & ~now.terminated)
         if self._records:
-            ends = (now.ended, over, self._acting)
+            ends = (now.ended, over, self._acting, memory)
             self._rows.append((self._obs, actions, now.rewards, now.obs, *ends))
             self._valid.append(active & self._record)
         if now.failed is not None and self._copies.spoiled is not None:

@@ -15,9 +15,11 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from ..compilation import jit
 from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.history import by_row, unrolled
+from ..networks.history import moments as seen_in
 from ..normalization import seen
 from ..replay import UNIFORM, Replay
-from ..types import NOTHING, Batch, Metrics
+from ..types import NOTHING, Batch, Metrics, Transition
 
 Learned = tuple[PyTree, Metrics]  # state and metrics
 Returns = Float[Array, "samples batch *agents"]
@@ -104,11 +106,25 @@ def _learn(learner, state, replay: Replay, updates, *, signal, key, **how):
 
 def minibatch(learner, replay: Replay, *, signal, moments=None, sampling=UNIFORM, key) -> Batch:
     """What a learner learns from in one step. Arguments as of `learn`."""
+    if replay.data.memory is not None:
+        return _in_windows(learner, replay, signal, moments, sampling, key)
     given = (learner.batch_size, sampling, learner.gamma)
     rows, discount = replay.sample(*given, together=learner.together, key=key)
+    return _batch(rows, signal, moments, rows.active, discount)
+
+
+def _batch(rows: Transition, signal: str, moments: Any, *rest: Any) -> Batch:
     reward, ends = rows.rewards[signal], (rows.terminated, rows.truncated)
     obs, after = seen(moments, rows.obs), seen(moments, rows.next_obs)
-    return Batch(obs, rows.action, reward, after, *ends, rows.active, discount)
+    return Batch(obs, rows.action, reward, after, *ends, *rest)
+
+
+def _in_windows(learner, replay: Replay, signal, moments, sampling, key) -> Batch:
+    """About as many rows that count, in windows."""
+    n = max(round(learner.batch_size / sampling.window), 1)
+    rows, windows, counts = replay.windows(n, sampling, together=learner.together, key=key)
+    counts = counts if rows.active is None else counts & rows.active
+    return _batch(rows, signal, moments, counts, None, windows)
 
 
 def scaled(learner: Any, replay: Replay, signal: str) -> Any:
@@ -168,11 +184,6 @@ def polyak(target: PyTree, source: PyTree, tau: Float[Array, ""] | float) -> PyT
     return eqx.combine(optax.incremental_update(new, old, tau), target)
 
 
-def features_first(x: Float[Array, "batch *agents size"]) -> Float[Array, "size batch *agents"]:
-    """Observations or actions as critics take them."""
-    return jnp.moveaxis(x, -1, 0)
-
-
 def mean(x: Float[Array, "*batch"], active: Bool[Array, "*batch"] | None) -> Float[Array, ""]:
     """The mean over the agents that acted; 0 if none did."""
     return jnp.mean(x) if active is None else _mean_where(x, active)
@@ -180,6 +191,13 @@ def mean(x: Float[Array, "*batch"], active: Bool[Array, "*batch"] | None) -> Flo
 
 def _mean_where(x: Array, active: Array) -> Array:
     return jnp.sum(x, where=active) / jnp.maximum(jnp.sum(active.astype(x.dtype)), 1.0)
+
+
+def acts(policy: AbstractPolicy, batch: Batch, later: bool = False) -> Array:
+    """What a policy does in the rows of a batch, or after them: `[batch, *agents, act]`."""
+    if batch.windows is None:
+        return act(policy, batch.observations(later))
+    return by_row(unrolled(policy, seen_in(batch, later), batch.windows), later)
 
 
 def act(policy: AbstractPolicy, obs: Float[Array, "batch *agents obs"]) -> Array:
@@ -202,13 +220,4 @@ def require_critic(asked: Any, learners: tuple[AbstractLearner, ...]) -> None:
         raise ValueError(
             f"{name} asks the critic of the first learner, and {type(learners[0]).__name__} has no "
             "method `value`: put TD3, DDPG or SAC first"
-        )
-
-
-def require_memoryless(network: AbstractNetwork, policy: AbstractPolicy) -> None:
-    """Minibatches of single frames cannot train a network with memory."""
-    if jax.tree.leaves(jax.eval_shape(lambda: policy.start(key=jax.random.key(0)))):
-        raise TypeError(
-            f"{type(network).__name__} has memory, and this learner learns from single frames: "
-            "give a feed-forward network such as MLP, or evolve without a learner: learners=()"
         )

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import require
+from ..networks.base import features_first
 from ..networks.mlp import AbstractCritic, AbstractCriticNetwork, Critic
-from .base import features_first
 from .predicted import AbstractPrediction, Frames
 
 

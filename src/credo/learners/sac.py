@@ -11,16 +11,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .. import require
 from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.history import by_row, moments, remembering, unrolled
 from ..networks.mlp import (
     MLP,
     AbstractCritic,
     AbstractCriticNetwork,
     Critic,
-    MLPPolicy,
     draw_layers,
     linear,
 )
@@ -30,12 +30,13 @@ from .base import (
     AbstractLearner,
     Returns,
     Value,
-    act,
+    acts,
     adam,
     adam_state,
     adam_steps,
     bellman,
     descend,
+    mean,
     polyak,
 )
 
@@ -51,17 +52,35 @@ LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0  # of the authors' code
 
 
 class StochasticActor(eqx.Module):
-    """A squashed Gaussian: its mean is the actor, its spread a head on the actor's features."""
+    """A squashed Gaussian: its mean is the actor, its spread a head on the actor's features.
 
-    mean: MLPPolicy
+    What is squashed is the action's inverse tanh. An actor that ends in a sigmoid σ(u), which an
+    MMU does, so has 2 σ(u) - 1 = tanh(u / 2) for its mean.
+    """
+
+    mean: AbstractPolicy
     head: dict[str, Float[Array, "..."]]  # W_0, b_0: features to log standard deviation
+    steepness: float = eqx.field(static=True, default=1.0)  # of the actor's output: 1, σ: 1/2
 
     def sample(
-        self, obs: Float[Array, "obs *batch"], *, key: PRNGKeyArray
+        self, batch: Batch, later: bool = False, *, key: PRNGKeyArray
+    ) -> tuple[Float[Array, "act batch"], Float[Array, " batch"]]:
+        """Actions in the rows of a batch, or in what follows them, and their log probability
+        density."""
+        obs = batch.observations(later)
+        if batch.windows is None:
+            features, mean, _ = self.mean.spoken(obs.T, ())
+        else:
+            seen = moments(batch, later)
+            told = unrolled(self.mean, seen, batch.windows, said=_spoken)
+            features, mean = (by_row(x, later).T for x in told)
+        return self.drawn(features, mean, key=key)
+
+    def drawn(
+        self, features: Float[Array, "units *batch"], output: Float[Array, "act *batch"], *, key
     ) -> tuple[Float[Array, "act *batch"], Float[Array, "*batch"]]:
-        """Actions and their log probability density."""
-        features = self.mean.features(obs)
-        mean = self.mean.output(features)
+        """Actions and their log probability density, of what the actor spoke."""
+        mean = self.steepness * output
         log_std = jnp.clip(linear(self.head, 0, features), LOG_STD_MIN, LOG_STD_MAX)
         noise = jax.random.normal(key, mean.shape)
         u = mean + jnp.exp(log_std) * noise
@@ -71,6 +90,16 @@ class StochasticActor(eqx.Module):
         return jnp.tanh(u), jnp.sum(log_p, axis=0)
 
 
+def _spoken(policy: AbstractPolicy):
+    """The output layer's input and output, and the next carry."""
+
+    def step(obs, carry):
+        features, output, carry = policy.spoken(obs, carry)
+        return (features, output), carry
+
+    return step
+
+
 class Sampler(AbstractPolicy):
     """Explores by drawing from the policy itself."""
 
@@ -78,14 +107,18 @@ class Sampler(AbstractPolicy):
     random: Bool[Array, ""]  # draw actions uniformly from [-1, 1]
     features_first: ClassVar[bool] = False
 
-    def start(self, *, key: PRNGKeyArray) -> PRNGKeyArray:
-        return key
+    def start(self, *, key: PRNGKeyArray) -> PyTree:
+        return self.actor.mean.start(key=key), key
+
+    def remembered(self, carry):
+        return self.actor.mean.remembered(carry[0])
 
     def __call__(self, obs, carry):
-        carry, sample_key, random_key = jax.random.split(carry, 3)
-        action, _ = self.actor.sample(obs, key=sample_key)
+        key, sample_key, random_key = jax.random.split(carry[1], 3)
+        features, output, memory = self.actor.mean.spoken(obs, carry[0])
+        action, _ = self.actor.drawn(features, output, key=sample_key)
         drawn = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
-        return jnp.where(self.random, drawn, action), carry
+        return jnp.where(self.random, drawn, action), (memory, key)
 
 
 class SACState(eqx.Module):
@@ -133,16 +166,16 @@ class SAC(AbstractLearner):
         require.at_least("temperature", self.temperature, 1e-8)
 
     def init(self, network: AbstractNetwork, *sizes: int, key: PRNGKeyArray) -> SACState:
-        if not (isinstance(network, MLP) and network.output_activation == "tanh"):
-            raise TypeError(f"SAC needs an MLP with a tanh output as its network, not {network}")
         obs_size, action_size = sizes
         actor_key, head_key, critic_key = jax.random.split(key, 3)
         mean = network.init(obs_size, action_size, key=actor_key)
-        units = network.hidden[-1] if network.hidden else obs_size
-        head = draw_layers((units, action_size), network.initializer, key=head_key)
-        actor = StochasticActor(mean, head)
+        units, steepness = _output_layer(network, mean, obs_size)
+        initializer = getattr(network, "initializer", "uniform")
+        head = draw_layers((units, action_size), initializer, key=head_key)
+        actor = StochasticActor(mean, head, steepness)
+        critic = remembering(self.critic) if network.remembers else self.critic
         critics = tuple(
-            self.critic.init(obs_size, action_size, key=key)
+            critic.init(obs_size, action_size, key=key)
             for key in jax.random.split(critic_key, self.critics)
         )
         log_alpha = jnp.log(jnp.float32(self.temperature))
@@ -165,9 +198,10 @@ class SAC(AbstractLearner):
             actor, opt, (loss, log_p) = descend(soft_actor_loss, given, *rate)
             # The temperature rises while the entropy -log_p is below its target.
             entropy = self.target_entropy * batch.action.shape[1]
-            gradient, rate = -jnp.mean(log_p + entropy), (state.alpha_opt, self.alpha_lr)
+            short = -mean(log_p + entropy, batch.active)
+            rate = (state.alpha_opt, self.alpha_lr)
             # Counted for the updates without one too, so that means over many updates are right.
-            return actor, opt, *adam(state.log_alpha, gradient, *rate), self.policy_delay * loss
+            return actor, opt, *adam(state.log_alpha, short, *rate), self.policy_delay * loss
 
         before = (state.actor, state.actor_opt, state.log_alpha, state.alpha_opt, jnp.float32(0.0))
         due = adam_steps(state.critic_opt) % self.policy_delay == 0
@@ -180,9 +214,9 @@ class SAC(AbstractLearner):
     def soft_target(self, state: SACState, batch: Batch, alpha: Scalar, *, key: Key) -> Returns:
         """y = r + γ (min_i Q'_i(s', a') - α log π(a'|s')), a' drawn from the policy; what the
         critics' `values` say in place of the minimum."""
-        obs = batch.next_obs.T
-        action, log_p = state.actor.sample(obs, key=key)
-        atoms = jnp.stack([critic.atoms(obs, action) for critic in state.target_critics])
+        action, log_p = state.actor.sample(batch, later=True, key=key)
+        targets = state.target_critics
+        atoms = jnp.stack([one.atoms(one.sees(batch, later=True), action) for one in targets])
         soft = state.target_critics[0].values.cautious(atoms) - alpha * log_p[None]
         return bellman(self, batch, soft, batch.terminated)
 
@@ -194,8 +228,8 @@ class SAC(AbstractLearner):
 
     def value(self, state: SACState, policy: AbstractPolicy, batch: Batch) -> Value:
         """By the lesser of the critics, without the policy's entropy."""
-        pair = (batch.obs.T, act(policy, batch.obs).T)
-        return jnp.min(jnp.stack([critic(*pair) for critic in state.critics]), axis=0)
+        action = acts(policy, batch).T
+        return jnp.min(jnp.stack([one(one.sees(batch), action) for one in state.critics]), axis=0)
 
     def warm(self, state: SACState, actor: AbstractPolicy) -> SACState:
         return eqx.tree_at(lambda s: s.actor.mean, state, actor)
@@ -216,9 +250,9 @@ def modern(**fields: Any) -> SAC:
 def soft_critic_error(critics: Critics, batch: Batch, target: Returns) -> tuple[Scalar, None]:
     """Half the sum over critics of the mean Bellman error, squared unless their `values` say
     otherwise."""
-    pair = (batch.obs.T, batch.action.T)
-    errors = jnp.stack([one.values.error(one.atoms(*pair), target) for one in critics])
-    return 0.5 * jnp.sum(jnp.mean(errors, axis=1)), None
+    atoms = [(one.values, one.atoms(one.sees(batch), batch.action.T)) for one in critics]
+    errors = jnp.stack([values.error(x, target) for values, x in atoms])
+    return 0.5 * jnp.sum(jax.vmap(lambda error: mean(error, batch.active))(errors)), None
 
 
 def soft_actor_loss(
@@ -228,6 +262,28 @@ def soft_actor_loss(
 
     SAC minimises the first, and needs the second for the temperature.
     """
-    action, log_p = actor.sample(batch.obs.T, key=key)
-    q = jnp.min(jnp.stack([critic(batch.obs.T, action) for critic in critics]), axis=0)
-    return jnp.mean(alpha * log_p - q), log_p
+    action, log_p = actor.sample(batch, key=key)
+    q = jnp.min(jnp.stack([one(one.sees(batch), action) for one in critics]), axis=0)
+    return mean(alpha * log_p - q, batch.active), log_p
+
+
+def _output_layer(network: AbstractNetwork, policy: AbstractPolicy, obs_size: int):
+    """How many numbers the output layer is given, and the slope of its activation beside tanh's.
+    Raises `TypeError` if the network does not tell."""
+
+    def parts():
+        obs, key = jnp.zeros(obs_size), jax.random.key(0)
+        return policy.spoken(obs, policy.start(key=key))
+
+    slope = {"tanh": 1.0, "sigmoid": 0.5}.get(getattr(network, "output_activation", ""))
+    try:
+        features, _, _ = jax.eval_shape(parts)
+    except NotImplementedError:
+        slope = None
+    if slope is None:
+        raise TypeError(
+            f"SAC draws actions around what a network's output layer says, and {network} has none "
+            "that ends in tanh or sigmoid: give MLP, RNN, GRU, LSTM, MMU, NTM or DNC, or train it "
+            "by TD3"
+        )
+    return features.shape[0], slope

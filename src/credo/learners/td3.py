@@ -15,8 +15,9 @@ import optax
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from .. import require
-from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.base import AbstractNetwork, AbstractPolicy, features_first
 from ..networks.exploration import AbstractNoise, Explorer, GaussianNoise, OrnsteinUhlenbeck
+from ..networks.history import remembering
 from ..networks.mlp import MLP, AbstractCritic, AbstractCriticNetwork, Critic, MLPPolicy
 from ..networks.team import JointCritic, TeamPolicy
 from ..types import Batch, Metrics
@@ -24,14 +25,12 @@ from .base import (
     AbstractLearner,
     Returns,
     Value,
-    act,
+    acts,
     adam_state,
     bellman,
     descend,
-    features_first,
     mean,
     polyak,
-    require_memoryless,
 )
 
 TD3_NETWORK = MLP(hidden=(256, 256), activation="relu", initializer="uniform")
@@ -112,12 +111,12 @@ class TD3(AbstractLearner):
     def init(self, network: AbstractNetwork, *sizes: int, key: Key) -> TD3State:
         actor_key, critic_key = jax.random.split(key)
         actor = network.init(*sizes, key=actor_key)
-        require_memoryless(network, actor)
+        critic = remembering(self.critic) if network.remembers else self.critic
         if isinstance(actor, MLPPolicy | TeamPolicy):
             actor = actor.scaled(self.actor_scale)
         seen = sizes if self.together else sizes[:2]
         keys = jax.random.split(critic_key, self.critics)
-        critics = tuple(self.critic.init(*seen, key=key) for key in keys)
+        critics = tuple(critic.init(*seen, key=key) for key in keys)
         opts = (adam_state(actor), adam_state(critics))
         return TD3State(actor, critics, actor, critics, *opts, jnp.int32(0), sizes[2:])
 
@@ -143,9 +142,10 @@ class TD3(AbstractLearner):
         place of the minimum."""
         noise = self.target_noise * jax.random.normal(key, batch.action.shape)
         noise = jnp.clip(noise, -self.target_noise_clip, self.target_noise_clip)
-        action = jnp.clip(act(state.target_actor, batch.next_obs) + noise, -1.0, 1.0)
-        pair = (features_first(batch.next_obs), features_first(action))
-        atoms = jnp.stack([critic.atoms(*pair) for critic in state.target_critics])
+        action = acts(state.target_actor, batch, later=True)
+        action = features_first(jnp.clip(action + noise, -1.0, 1.0))
+        targets = state.target_critics
+        atoms = jnp.stack([one.atoms(one.sees(batch, later=True), action) for one in targets])
         ended = batch.terminated | (batch.truncated & (not self.bootstrap_truncated))
         return bellman(self, batch, state.target_critics[0].values.cautious(atoms), ended)
 
@@ -158,8 +158,8 @@ class TD3(AbstractLearner):
 
     def value(self, state: TD3State, policy: AbstractPolicy, batch: Batch) -> Value:
         """By the first critic, which the actor follows too."""
-        actions = map(features_first, (act(policy, batch.obs), batch.action))
-        return state.critics[0].own(features_first(batch.obs), *actions)
+        actions = map(features_first, (acts(policy, batch), batch.action))
+        return state.critics[0].own(state.critics[0].sees(batch), *actions)
 
     def warm(self, state: TD3State, actor: AbstractPolicy) -> TD3State:
         return eqx.tree_at(lambda s: (s.actor, s.target_actor), state, (actor, actor))
@@ -191,8 +191,8 @@ def maddpg(**fields: Any) -> TD3:
 def critic_error(critics: Critics, batch: Batch, target: Returns) -> tuple[Array, Array]:
     """Sum over critics of the mean Bellman error, squared unless their `values` say otherwise, and
     their mean value."""
-    pair = (features_first(batch.obs), features_first(batch.action))
-    atoms = [(critic.values, critic.atoms(*pair)) for critic in critics]
+    action = features_first(batch.action)
+    atoms = [(critic.values, critic.atoms(critic.sees(batch), action)) for critic in critics]
     errors = [mean(values.error(x, target), batch.active) for values, x in atoms]
     values = [mean(values.mean(x), batch.active) for values, x in atoms]
     return jnp.sum(jnp.stack(errors)), jnp.mean(jnp.stack(values))
@@ -200,6 +200,6 @@ def critic_error(critics: Critics, batch: Batch, target: Returns) -> tuple[Array
 
 def actor_loss(actor: AbstractPolicy, critic: AbstractCriticNetwork, batch: Batch):
     """Minus the value of what the actor would do (deterministic policy gradient)."""
-    actions = (act(actor, batch.obs), batch.action)
-    q = critic.own(features_first(batch.obs), *map(features_first, actions))
+    actions = (acts(actor, batch), batch.action)
+    q = critic.own(critic.sees(batch), *map(features_first, actions))
     return -mean(q, batch.active), None

@@ -16,6 +16,7 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
@@ -57,12 +58,44 @@ class AbstractPolicy(eqx.Module):
         """The same policy, laid out for many steps: rollouts in JAX ask for it once."""
         return self
 
+    def remembered(self, carry: PyTree) -> Float[Array, "*agents memory"] | None:
+        """What a carry holds, as a vector that a replay buffer keeps; None if that is nothing. Of a
+        team each agent's, with what all of them share in each."""
+        numbers = [x for x in jax.tree.leaves(carry) if eqx.is_inexact_array(x)]
+        return jnp.concatenate([x.reshape(-1) for x in numbers]) if numbers else None
+
+    def recalled(self, memory: Float[Array, "*agents memory"], *, key: PRNGKeyArray) -> PyTree:
+        """The carry that holds a vector of `remembered`; `key` is for what it draws."""
+        numbers, rest = eqx.partition(self.start(key=key), eqx.is_inexact_array)
+        return eqx.combine(jax.flatten_util.ravel_pytree(numbers)[1](memory), rest)
+
+    def spoken(self, obs: Float[Array, " obs"], carry: PyTree) -> tuple[Array, Array, PyTree]:
+        """`__call__` in its parts: what the output layer is given, what it says before its
+        activation, and the next carry. SAC needs it: its spread is a second output layer."""
+        raise NotImplementedError(f"{type(self).__name__} does not tell its output layer apart")
+
 
 class AbstractNetwork(eqx.Module):
     """The config of a policy."""
 
     team: ClassVar[bool] = False
     """Whether its policies act for all agents; `init` then takes their number behind the sizes."""
+
+    @property
+    def remembers(self) -> bool:
+        """Whether its policies have memory."""
+        sizes = (2, 1, 2) if self.team else (2, 1)
+
+        def carry():
+            return self.init(*sizes, key=jax.random.key(0)).start(key=jax.random.key(0))
+
+        return bool(jax.tree.leaves(jax.eval_shape(carry)))
+
+    @property
+    def together(self) -> bool:
+        """Whether agents of a team share more than weights, so that their frames must be those of
+        one moment."""
+        return False
 
     @abc.abstractmethod
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> AbstractPolicy:
@@ -100,6 +133,11 @@ def draw(
         name: scale(shape) * noise[start : start + size].reshape(shape)
         for (name, shape), start, size in zip(shapes.items(), cuts, sizes, strict=False)
     }
+
+
+def features_first(x: Float[Array, "batch *agents size"]) -> Float[Array, "size batch *agents"]:
+    """Observations or actions as critics take them."""
+    return jnp.moveaxis(x, -1, 0)
 
 
 def to_action(output: Float[Array, "act *batch"], activation: str) -> Float[Array, "act *batch"]:

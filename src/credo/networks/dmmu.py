@@ -89,6 +89,14 @@ class DMMU(AbstractNetwork):
             )
 
     @property
+    def remembers(self) -> bool:
+        return True
+
+    @property
+    def together(self) -> bool:
+        return True
+
+    @property
     def cells(self) -> int:
         if self.memory is not None:
             return self.memory
@@ -167,6 +175,15 @@ class DMMUPolicy(AbstractPolicy):
         own, m = _apart(self.agents[0].start())
         private = jnp.zeros((len(self.agents), *own.shape))
         return DMMUCarry(private, m, key if self.config.order == "random" else None)
+
+    def remembered(self, carry: DMMUCarry) -> Float[Array, "agents memory"]:
+        shared = jnp.broadcast_to(carry.memory, (len(self.agents), carry.memory.size))
+        return jnp.concatenate([carry.private, shared], axis=1)
+
+    def recalled(self, memory, *, key):
+        own = self.start(key=key).private.shape[1]
+        key = key if self.config.order == "random" else None
+        return DMMUCarry(memory[:, :own], memory[0, own:], key)
 
     def __call__(
         self, obs: Float[Array, "agents obs"], carry: DMMUCarry

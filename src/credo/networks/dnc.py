@@ -85,6 +85,11 @@ class DNCPolicy(AbstractPolicy):
         return state, read, at_read, rows, rows, rows, links, zeros((c.rows, c.width))
 
     def __call__(self, obs, carry):
+        _, y, carry = self.spoken(obs, carry)
+        y = ACTIVATIONS[self.config.output_activation](y)
+        return to_action(y, self.config.output_activation), carry
+
+    def spoken(self, obs, carry):
         state, read, at_read, at_write, used, last, links, memory = carry
         w, c, σ = self.weights, self.config, ACTIVATIONS["sigmoid"]
         h, state = control(w, c.controller, jnp.concatenate([obs, read]), state)
@@ -100,9 +105,8 @@ class DNCPolicy(AbstractPolicy):
         at_read = self._where_to_read(h, at_read, links, memory)
         read = (at_read @ memory).ravel()
         y = w["Z_y"] @ h + w["Z_r"] @ read + w["b_y"]
-        y = ACTIVATIONS[c.output_activation](y)
         carry = state, read, at_read, at_write, used, last, links, memory
-        return to_action(y, c.output_activation), carry
+        return jnp.concatenate([h, read]), y, carry
 
     def _emitted(self, name: str, h: Array) -> Array:
         """A part of the interface vector, before its activation."""

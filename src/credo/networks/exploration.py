@@ -67,6 +67,9 @@ class Explorer(AbstractPolicy):
         policy_key, noise_key = jax.random.split(key)
         return self.policy.start(key=policy_key), jnp.zeros(self.shape), noise_key
 
+    def remembered(self, carry):
+        return self.policy.remembered(carry[0])
+
     def __call__(self, obs, carry):
         carry, before, key = carry
         key, noise_key, random_key = jax.random.split(key, 3)

@@ -11,12 +11,14 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .. import require
+from ..types import Batch
 from .base import (
     ACTIVATIONS,
     INITIALIZERS,
     AbstractNetwork,
     AbstractPolicy,
     draw,
+    features_first,
     matvec,
     to_action,
 )
@@ -64,6 +66,10 @@ class MLPPolicy(AbstractPolicy):
     def __call__(self, obs, carry):
         return self.action(self.output(self.features(obs))), carry
 
+    def spoken(self, obs, carry):
+        features = self.features(obs)
+        return features, self.output(features), carry
+
     def features(self, obs: Float[Array, "obs *batch"]) -> Float[Array, "units *batch"]:
         """The last hidden layer."""
         c = self.config
@@ -104,6 +110,10 @@ class AbstractCriticNetwork(eqx.Module):
 
     action_size: eqx.AbstractVar[int]
     values: eqx.AbstractVar[AbstractValues]  # what its outputs say of the return
+
+    def sees(self, batch: Batch, later: bool = False) -> Float[Array, "obs batch *agents"]:
+        """What it sees of the rows of a batch, or of what follows them: what `atoms` takes."""
+        return features_first(batch.observations(later))
 
     @abc.abstractmethod
     def atoms(

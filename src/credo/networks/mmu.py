@@ -170,6 +170,10 @@ class MMUPolicy(AbstractPolicy):
         return y, (jnp.zeros_like(self.b_w) if self.m_0 is None else self.m_0)
 
     def __call__(self, obs, carry):
+        _, _, (y, m) = self.spoken(obs, carry)
+        return to_action(y, self.config.output_activation), (y, m)
+
+    def spoken(self, obs, carry):
         x, (y, m), c = obs, carry, self.config
         σ = ACTIVATIONS["sigmoid"]
         φ, θ_d, θ_f, φ_y = (
@@ -190,8 +194,8 @@ class MMUPolicy(AbstractPolicy):
             m = m + w * f
         else:
             m = (1.0 - c.alpha) * (m + w * f) + c.alpha * (w * f + (1.0 - w) * m)  # (3.4)
-        y = φ_y(matvec(self.Z_y, h) + self.b_y)  # (3.5)
-        return to_action(y, c.output_activation), (y, m)
+        u = matvec(self.Z_y, h) + self.b_y
+        return h, u, (φ_y(u), m)  # (3.5)
 
     def _inputs(self, x, y, m):
         """What the input gate, the block input, the read gate and the write gate are fed."""

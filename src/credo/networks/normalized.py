@@ -25,6 +25,9 @@ class Normalized(AbstractPolicy):
     def start(self, *, key: PRNGKeyArray) -> PyTree:
         return self.policy.start(key=key)
 
+    def remembered(self, carry):
+        return self.policy.remembered(carry)
+
     def __call__(self, obs, carry):
         return self.policy(scaled(obs, self.mean, self.std), carry)
 

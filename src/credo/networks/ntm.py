@@ -127,6 +127,11 @@ class NTMPolicy(AbstractPolicy):
         return state, w["r_0"], *at, memory
 
     def __call__(self, obs, carry):
+        _, y, carry = self.spoken(obs, carry)
+        y = ACTIVATIONS[self.config.output_activation](y)
+        return to_action(y, self.config.output_activation), carry
+
+    def spoken(self, obs, carry):
         (state, read, at_read, at_write, memory), w = carry, self.weights
         c = self.config
         h, state = control(w, c.controller, jnp.concatenate([obs, read]), state)
@@ -137,8 +142,7 @@ class NTMPolicy(AbstractPolicy):
         at_read = self._address("r", h, at_read, memory)
         read = (at_read @ memory).ravel()  # (2)
         y = w["Z_y"] @ h + w["Z_r"] @ read + w["b_y"]
-        y = ACTIVATIONS[c.output_activation](y)
-        return to_action(y, c.output_activation), (state, read, at_read, at_write, memory)
+        return jnp.concatenate([h, read]), y, (state, read, at_read, at_write, memory)
 
     def _emitted(self, name: str, kind: str, h: Array) -> Float[Array, "heads size"]:
         """A quantity of the heads of one kind, before its activation."""

@@ -63,10 +63,13 @@ class RecurrentPolicy(AbstractPolicy):
         return (zeros, zeros) if self.config.cell == "lstm" else zeros
 
     def __call__(self, obs, carry):
-        h, carry = getattr(self, f"_{self.config.cell}")(obs, carry)
-        φ = ACTIVATIONS[self.config.output_activation]
-        y = φ(matvec(self.weights["Z_y"], h) + self.weights["b_y"])
+        _, y, carry = self.spoken(obs, carry)
+        y = ACTIVATIONS[self.config.output_activation](y)
         return to_action(y, self.config.output_activation), carry
+
+    def spoken(self, obs, carry):
+        h, carry = getattr(self, f"_{self.config.cell}")(obs, carry)
+        return h, matvec(self.weights["Z_y"], h) + self.weights["b_y"], carry
 
     def _gate(self, gate, x, h):
         weights = self.weights

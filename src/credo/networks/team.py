@@ -101,6 +101,19 @@ class TeamPolicy(AbstractPolicy):
             return tuple(head.start(key=keys[i]) for i, head in enumerate(self.heads))
         return self._each(lambda _, head, key: head.start(key=key), keys)
 
+    def remembered(self, carry):
+        if self.apart:
+            each = [head.remembered(own) for head, own in zip(self.heads, carry, strict=True)]
+            return None if None in each else jnp.stack(each)  # pyright: ignore
+        return self._each(lambda _, head, own: head.remembered(own), carry)
+
+    def recalled(self, memory, *, key):
+        keys = jax.random.split(key, self.agents)
+        if self.apart:
+            each = zip(self.heads, memory, keys, strict=True)
+            return tuple(head.recalled(own, key=key) for head, own, key in each)
+        return self._each(lambda _, head, own, key: head.recalled(own, key=key), memory, keys)
+
     def __call__(
         self, obs: Float[Array, "agents obs"], carry: PyTree
     ) -> tuple[Float[Array, "agents act"], PyTree]:
@@ -159,6 +172,10 @@ class Centralized(AbstractNetwork):
 
     network: AbstractNetwork = MLP(hidden=(300,))  # the network that acts for all agents
 
+    @property
+    def together(self) -> bool:
+        return True
+
     def init(
         self, obs_size: int, action_size: int, agents: int = 1, *, key: PRNGKeyArray
     ) -> "CentralizedPolicy":
@@ -175,6 +192,13 @@ class CentralizedPolicy(AbstractPolicy):
 
     def start(self, *, key: PRNGKeyArray) -> PyTree:
         return self.policy.start(key=key)
+
+    def remembered(self, carry):
+        memory = self.policy.remembered(carry)
+        return None if memory is None else jnp.broadcast_to(memory, (self.agents, memory.size))
+
+    def recalled(self, memory, *, key):
+        return self.policy.recalled(memory[0], key=key)
 
     def __call__(
         self, obs: Float[Array, "agents obs"], carry: PyTree

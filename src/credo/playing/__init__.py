@@ -8,7 +8,7 @@ processes, and played again where one of these died.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -18,6 +18,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, UInt32
 
 from ..environments.host import AbstractHostEnvironment, Episodes
 
+Record = Literal["nothing", "frames", "memory"]
+
 
 @dataclasses.dataclass(frozen=True)
 class Part:
@@ -25,7 +27,7 @@ class Part:
 
     `policies`: the data of a key for each episode, by which a policy starts. Of its episodes each
     member plays the first `wanted`, of `limit` steps at most; None: as many as the task has.
-    `record`: whether transitions are kept.
+    `record`: what is kept of a step, nothing, the transition, or with it the policy's memory.
     """
 
     env: AbstractHostEnvironment
@@ -33,7 +35,7 @@ class Part:
     worlds: UInt32[np.ndarray, "members episodes"]
     policies: UInt32[np.ndarray, "members episodes 2"]
     wanted: int
-    record: bool
+    record: Record
     limit: int | None = None
 
 
@@ -59,6 +61,7 @@ class _Group:
         _, actions, *team = part.env.sizes
         self._idle = np.zeros((part.worlds.size, *team, actions), np.float32)
         self.begin()
+        self.remembers = part.record == "memory" and self.memory() is not None
 
     def begin(self) -> None:
         """The memories with which a turn begins."""
@@ -71,12 +74,17 @@ class _Group:
         action, self._carry = act(self._form, self._arrays, obs[self.lanes], self._carry)
         return action
 
+    def memory(self) -> np.ndarray | None:
+        """What the policies of its lanes remember; None: nothing."""
+        found = remembered(self._form, self._arrays, self._carry)
+        return None if found is None else np.asarray(found)
+
 
 def play(parts: Sequence[Part]) -> list[Outcome]:
     """Play parts of one task here. All take each step together, so that it is asked once."""
     env, sizes = parts[0].env, [part.worlds.size for part in parts]
     groups = [_Group(part, sum(sizes[:i])) for i, part in enumerate(parts)]
-    record = np.repeat([part.record for part in parts], sizes)
+    record = np.repeat([part.record != "nothing" for part in parts], sizes)
     limits = [env.max_steps if part.limit is None else part.limit for part in parts]
     told = Episodes(env, sum(sizes), record, np.repeat(limits, sizes))
     wanted = [np.tile(np.arange(p.worlds.shape[1]) < p.wanted, len(p.worlds)) for p in parts]
@@ -86,18 +94,36 @@ def play(parts: Sequence[Part]) -> list[Outcome]:
         for group in groups:
             group.begin()
         while told.ongoing:
+            memory = _memory(groups)
             actions = [group.act(obs, told.active) for group in groups]
-            obs = told.advance(np.concatenate(actions) if len(groups) > 1 else np.asarray(*actions))
+            actions = np.concatenate(actions) if len(groups) > 1 else np.asarray(*actions)
+            obs = told.advance(actions, memory)
         if told.again.any():
             turns.append(told.again)
-    return [_outcome(part, told, group.lanes) for part, group in zip(parts, groups, strict=True)]
+    return [_outcome(part, told, group) for part, group in zip(parts, groups, strict=True)]
 
 
-def _outcome(part: Part, told: Episodes, lanes: slice) -> Outcome:
-    """What came of some lanes."""
+def _memory(groups: Sequence[_Group]) -> np.ndarray | None:
+    """What the policies of all lanes remember; zeros where nobody wants to know, and None if there
+    is nothing."""
+    found = [group.memory() if group.remembers else None for group in groups]
+    shape = next((x.shape[1:] for x in found if x is not None), None)
+    if shape is None:
+        return None
+    unasked = (
+        np.zeros((group.lanes.stop - group.lanes.start, *shape), np.float32) for group in groups
+    )
+    return np.concatenate([z if x is None else x for x, z in zip(found, unasked, strict=True)])
+
+
+def _outcome(part: Part, told: Episodes, group: _Group) -> Outcome:
+    """What came of a group's lanes."""
+    lanes, remembers = group.lanes, group.remembers
     shape = part.worlds.shape
     returns = {name: x[lanes].reshape(*shape, *x.shape[1:]) for name, x in told.returns().items()}
-    rows = told.rows(lanes) if part.record else None
+    rows = told.rows(lanes) if part.record != "nothing" else None
+    if rows is not None and not remembers:  # others, who were played beside it, did
+        rows = (*rows[:-1], None)
     return Outcome(returns, told.steps[lanes].reshape(shape), rows)
 
 
@@ -207,6 +233,16 @@ def act(form: Form, arrays, obs: Array, carry: PyTree):
     obs = obs.reshape(pop, -1, *obs.shape[1:]).astype(jnp.float32)
     actions, carry = acted(form.filled(arrays), obs, carry)
     return actions.reshape(-1, *actions.shape[2:]), carry
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def remembered(form: Form, arrays, carry: PyTree) -> Array | None:
+    """What policies remember, one lane behind the other; None: nothing."""
+    if not jax.tree.leaves(carry):
+        return None
+    told = eqx.filter_vmap(lambda p, own: jax.vmap(p.remembered)(own))
+    memory = told(form.filled(arrays), carry)
+    return None if memory is None else memory.reshape(-1, *memory.shape[2:])
 
 
 def world_keys(pop: int, episodes: int, common: bool, *, key: PRNGKeyArray) -> PRNGKeyArray:
