@@ -368,8 +368,9 @@ def filled(capacity, *rounds, team=()):
 def test_windows_stay_in_their_episode(lengths, burn_in):
     """In a ring of 12: more than that were written in the last two cases."""
     ring, n, sampling = filled(12, told(lengths)), 500, Sampling(window=4, burn_in=burn_in)
-    draw = jax.jit(lambda key: ring.windows(n, sampling, key=key))
-    rows, windows, counts = draw(jax.random.key(0))
+    draw = jax.jit(lambda key: ring.windows(4 * n, sampling, key=key))
+    rows, _, windows = draw(jax.random.key(0))
+    counts = rows.active
     length = 4 + burn_in
     assert rows.memory is None
     assert (windows.length, windows.burn_in) == (length, burn_in)
@@ -397,7 +398,8 @@ def test_windows_of_a_team_are_each_agents_own_or_of_one_moment():
     ring = filled(40, told([7, 9, 5], team=(2,)), team=(2,))
     sampling = Sampling(window=4, burn_in=1)
     for together in (False, True):
-        rows, windows, counts = ring.windows(64, sampling, together=together, key=jax.random.key(0))
+        rows, _, windows = ring.windows(256, sampling, together=together, key=jax.random.key(0))
+        counts = rows.active
         assert rows.obs.shape == (64 * 5, 2, 2)
         assert counts.shape == (64 * 5, 2)
         assert windows.fresh.shape == (64, 2)
@@ -412,7 +414,7 @@ def test_what_stands_behind_an_end_is_not_told():
     rows = told([3, 4])
     second = np.where(rows.obs[:, :1] == 1, np.nan, rows.obs)
     broken = eqx.tree_at(lambda r: r.obs, rows, second)
-    found, *_ = filled(20, broken).windows(50, Sampling(window=3), key=jax.random.key(0))
+    found, *_ = filled(20, broken).windows(150, Sampling(window=3), key=jax.random.key(0))
     first = np.asarray(found.action).reshape(50, -1)[:, 0] == 0
     assert np.isfinite(np.asarray(found.obs).reshape(50, -1)[first]).all()
 

@@ -58,7 +58,7 @@ class Sampling(eqx.Module):
 
 UNIFORM = Sampling()
 Sampled = tuple[Transition, Any]  # and the discount behind each, or None
-Windowed = tuple[Transition, Windows, Array]  # and which rows count
+Windowed = tuple[Transition, None, Windows]
 
 
 def _recent(replay: "Replay", half_life: float, u: Array) -> Array:
@@ -127,14 +127,17 @@ class Replay(eqx.Module):
         rows = self._rows(index)
         return (rows, None) if sampling.steps == 1 else self._followed(rows, index, sampling, gamma)
 
-    def windows(self, n: int, sampling=UNIFORM, *, together=False, key) -> Windowed:
-        """`n` windows of `sampling.burn_in + sampling.window` rows, each with a row drawn as by
-        `sample` among those that count. What stands behind the end of an episode is zeros and does
-        not count, nor does the burn-in of a window that begins within an episode.
+    def windows(
+        self, n: int, sampling=UNIFORM, gamma: Any = 1.0, *, together=False, key
+    ) -> Windowed:
+        """About `n` rows in windows of `sampling.burn_in + sampling.window`, each with a row drawn
+        as by `sample` among those that count. What stands behind the end of an episode is zeros and
+        does not count, nor does the burn-in of a window that begins within an episode.
 
-        **Returns:** the rows, `[n · length, *agents, ...]`, the windows, and which rows count,
-        `[n · length, *agents]`.
+        **Returns:** the rows, `[windows · length, *agents, ...]`, `active` where they count; None,
+        for each spans one step (`sample`); and the windows.
         """
+        n = max(round(n / sampling.window), 1)
         length, team = sampling.burn_in + sampling.window, self.data.action.shape[1:-1]
         row_key, place_key = jax.random.split(key)
         shape = (n, *(() if together else team))
@@ -153,8 +156,9 @@ class Replay(eqx.Module):
         if not team:
             at, first, fresh = at[:, 0], first[:, 0], fresh[:, 0]
         rows = jax.tree.map(lambda x: _where(inside, x), replace(self._rows(at), memory=None))
-        about = Windows(fresh, self._rows(first).memory, length, sampling.burn_in)  # pyright: ignore
-        return rows, about, counts
+        rows = replace(rows, active=counts if rows.active is None else counts & rows.active)
+        memory: Any = self._rows(first).memory
+        return rows, None, Windows(fresh, memory, length, sampling.burn_in)
 
     @property
     def _oldest(self) -> Int[Array, ""]:

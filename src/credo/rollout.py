@@ -9,7 +9,6 @@ import dataclasses
 import math
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -23,8 +22,8 @@ from .compilation import float32, jit
 from .environments.base import AbstractEnvironment, AbstractSequenceTask, correct, several
 from .environments.host import AbstractHostEnvironment, EnvironmentFailure, Episodes, sound
 from .environments.wrappers import Given
-from .networks.base import AbstractNetwork, AbstractPolicy
-from .playing import Record, acted, devices, each, players, started, world_keys
+from .networks.base import AbstractPolicy
+from .playing import acted, devices, each, players, started, world_keys
 from .types import Evaluation, Sequence, Trace, Transition, plain
 
 Environment = AbstractEnvironment | AbstractHostEnvironment
@@ -99,63 +98,43 @@ def evaluate(
     and not luck; otherwise each member draws its own.
     """
     if isinstance(env, AbstractHostEnvironment):
-        return _play_on_host(env, population, episodes, episodes, common, "nothing", key=key)[0]
-    packed = getattr(population, "features_first", False)
+        return _play_on_host(env, population, episodes, episodes, common, False, key=key)[0]
     if isinstance(env, Given):
         env.require_once(population, episodes)
-    if isinstance(env, AbstractSequenceTask) and packed:
+    if isinstance(env, AbstractSequenceTask) and getattr(population, "features_first", False):
         return _answer(env, population, episodes, common, key=key)
     play = _play_in_turn if tree.batch(population) < tree.size(population) else _play
-    lanes = _lanes(population, episodes, common, key=key)
-    return play(env, lanes, jnp.int32(episodes), "nothing")[0]
+    return play(env, _lanes(population, episodes, common, key=key), jnp.int32(episodes), False)[0]
 
 
 @float32()
 def collect(
-    env: Environment,
-    population: PyTree,
-    episodes: int,
-    *,
-    wanted=None,
-    common=True,
-    limit=None,
-    remember=False,
-    key,
+    env: Environment, population, episodes: int, *, wanted=None, common=True, limit=None, key
 ) -> tuple[Evaluation, Experience]:
     """`evaluate`, and every transition that was met. Outside JAX a finished episode costs no more
     physics; in JAX all lanes of a device step until the last one of them ends.
 
     **Arguments:** of its `episodes` each member plays the first `wanted`, None: all; that number is
     data. The others have no steps and a return of 0. Episodes are truncated after `limit` steps,
-    which is data too; None: when the task ends them. `remember`: transitions have the `memory` of
-    policies that have any.
+    which is data too; None: when the task ends them.
     """
-    wanted, record = episodes if wanted is None else wanted, "memory" if remember else "frames"
+    wanted = episodes if wanted is None else wanted
     if isinstance(env, AbstractHostEnvironment):
-        return _play_on_host(env, population, episodes, wanted, common, record, limit, key=key)
-    lanes = _lanes(population, episodes, common, key=key)
-    return _play(env, lanes, jnp.int32(wanted), record, limit)
+        return _play_on_host(env, population, episodes, wanted, common, True, limit, key=key)
+    return _play(env, _lanes(population, episodes, common, key=key), jnp.int32(wanted), True, limit)
 
 
 @float32()
 def begun(
-    env: Environment,
-    population: PyTree,
-    episodes: int,
-    *,
-    wanted=None,
-    common=True,
-    remember=False,
-    key,
+    env: Environment, population: PyTree, episodes: int, *, wanted=None, common=True, key
 ) -> Callable[[], tuple[Evaluation, Experience]]:
     """`collect` of what is wanted later: call it for the result. Outside JAX nothing is played
     before that, unless `playing.players.start` lets other processes begin."""
     if not isinstance(env, AbstractHostEnvironment):
-        how = {"wanted": wanted, "common": common, "remember": remember, "key": key}
-        found = collect(env, population, episodes, **how)
+        found = collect(env, population, episodes, wanted=wanted, common=common, key=key)
         return lambda: found
-    wanted, record = episodes if wanted is None else wanted, "memory" if remember else "frames"
-    asked = players.ask(_part(env, population, episodes, wanted, common, record, key=key))
+    wanted = episodes if wanted is None else wanted
+    asked = players.ask(_part(env, population, episodes, wanted, common, True, key=key))
     return lambda: _told(asked.result())
 
 
@@ -242,14 +221,14 @@ def _postpone(
 ) -> Float[Array, ""]:
     """The score from before, in the place of one that comes later."""
     assert _TESTS.postponed is not None
-    part = _part(env, tree.single(policy), episodes, episodes, True, "nothing", key=key)
+    part = _part(env, tree.single(policy), episodes, episodes, True, False, key=key)
     _TESTS.postponed.append(Postponed(env, players.ask(part), reward))
     return jnp.float32(before)
 
 
-def blank(env: Environment, network: AbstractNetwork | None = None) -> Transition:
-    """A transition of this task, all zeros: its shapes and types; with the memory of policies of a
-    `network`, where they have any."""
+def blank(env: Environment, policy: AbstractPolicy | None = None) -> Transition:
+    """A transition of this task, all zeros: its shapes and types; and those of what a `policy`
+    remembers."""
     obs_size, action_size, *team = env.sizes
     obs = jnp.zeros((*team, obs_size), getattr(env, "obs_dtype", "float32"))
     action = jnp.zeros((*team, action_size))
@@ -260,19 +239,8 @@ def blank(env: Environment, network: AbstractNetwork | None = None) -> Transitio
         _, first = jax.eval_shape(lambda: env.reset(key=jax.random.key(0)))
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), first)
         rewards, ended, active = zeros.rewards, zeros.ended, zeros.active
-    memory = None if network is None else _memory(network, env.sizes)
+    memory = jax.tree.map(jnp.zeros_like, policy and policy.first())
     return Transition(obs, action, rewards, obs, ended, jnp.bool_(False), active, memory)
-
-
-def _memory(network: AbstractNetwork, sizes: tuple[int, ...]) -> Array | None:
-    """What a policy remembers, all zeros; None: nothing."""
-
-    def start():
-        policy = network.init(*sizes, key=jax.random.key(0))
-        return policy.remembered(policy.start(key=jax.random.key(0)))
-
-    shape = jax.eval_shape(start)
-    return None if shape is None else jnp.zeros(shape.shape, shape.dtype)
 
 
 @jit
@@ -300,7 +268,7 @@ def _answer(
 
 @jit
 @devices.shared
-def _play_in_turn(env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: Record):
+def _play_in_turn(env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: bool):
     """Large policies some at a time: their weights stay in the cache from step to step."""
     return tree.in_batches(lambda some: _play(env, some, wanted, record), lanes)
 
@@ -308,11 +276,7 @@ def _play_in_turn(env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""
 @jit
 @devices.shared
 def _play(
-    env: AbstractEnvironment,
-    lanes: PyTree,
-    wanted: Int[Array, ""],
-    record: Record,
-    limit: Any = None,
+    env: AbstractEnvironment, lanes: PyTree, wanted: Int[Array, ""], record: bool, limit: Any = None
 ) -> tuple[Evaluation, Any]:
     """All lanes `[pop, episodes]` take each step together, so that a row of the buffer is written
     in place; a `vmap` of whole episodes would copy the buffer at every step. `lanes`: policies
@@ -328,16 +292,8 @@ def _play(
     # Where policy or world said NaN the episode goes on, has a return of NaN, and is forgotten.
     lost = active & ~_sound(first.obs)
     totals = (jax.tree.map(jnp.zeros_like, first.rewards), jnp.zeros(lanes, jnp.int32), lost)
-    rows: Any = None
-    if record != "nothing":
-        row = (blank(env), jnp.bool_(False))
-        rows = jax.tree.map(lambda x: jnp.zeros((env.max_steps, *lanes, *x.shape), x.dtype), row)
-        if record == "memory":
-            memory = _remembered(population, carries)
-            empty = (
-                None if memory is None else jnp.zeros((env.max_steps, *memory.shape), memory.dtype)
-            )
-            rows = (replace(rows[0], memory=empty), rows[1])
+    row = (blank(env, tree.take(population, 0)), jnp.bool_(False)) if record else None
+    rows = jax.tree.map(lambda x: jnp.zeros((env.max_steps, *lanes, *x.shape), x.dtype), row)
     start = (jnp.int32(0), states, (first.obs, first.active), carries, active, totals, rows)
 
     def ongoing(loop):
@@ -346,8 +302,7 @@ def _play(
 
     def advance(loop):
         t, states, (obs, acting), carries, active, (returns, steps, lost), rows = loop
-        before = carries
-        actions, carries = acted(population, obs, carries)
+        actions, carries, memory = acted(population, obs, carries)
         sound = _sound(actions)
         actions = jnp.where(jnp.isfinite(actions), actions, 0.0)
         keys = each(lambda key: jax.random.fold_in(key, t))(step_keys)
@@ -360,8 +315,7 @@ def _play(
         paid = jax.tree.map(lambda x: jnp.where(_over(active, x), x, 0.0), step.rewards)
         returns = jax.tree.map(jnp.add, returns, paid)
         steps = steps + active.astype(jnp.int32)
-        if record != "nothing":
-            memory = _remembered(population, before) if record == "memory" else None
+        if record:
             ends = (step.ended, step.truncated, acting, memory)
             row = (Transition(obs, actions, step.rewards, step.obs, *ends), active)
             rows = jax.tree.map(lambda xs, x: xs.at[t].set(x), rows, row)
@@ -374,13 +328,6 @@ def _play(
     kept = rows and (rows[0], rows[1] & ~lost[None])
     flat = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 2).reshape(-1, *x.shape[3:]), kept)
     return Evaluation(returns, steps), flat and Experience(*flat)
-
-
-def _remembered(population: PyTree, carries: PyTree) -> Array | None:
-    """What the policies of all lanes remember; None: nothing."""
-    if not jax.tree.leaves(carries):
-        return None
-    return eqx.filter_vmap(lambda p, own: jax.vmap(p.remembered)(own))(population, carries)
 
 
 def _sound(x: Array) -> Bool[Array, "pop episodes"]:
@@ -430,7 +377,7 @@ def _record_on_host(
     obs = told.begin(seeds, np.ones(1, bool))
     see(not told.ongoing)
     while told.ongoing:
-        action, carry = playing.act(form, arrays, obs, carry)
+        action, carry, _ = playing.act(form, arrays, obs, carry)
         obs = told.advance(np.asarray(action))
         carries.append(carry)
         see(not told.ongoing)
@@ -465,7 +412,7 @@ def _part(
     episodes: int,
     wanted: Int[Array, ""] | int,
     common: bool,
-    record: Record,
+    record: bool,
     limit: Any = None,
     *,
     key: PRNGKeyArray,

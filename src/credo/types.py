@@ -133,10 +133,6 @@ class Batch(eqx.Module):
     None: it is one step."""
     windows: Windows | None = None  # how rows follow each other; None: they are frames on their own
 
-    def observations(self, later: bool = False) -> Float[Array, "batch *agents obs"]:
-        """Those of the rows, or those that follow them."""
-        return self.next_obs if later else self.obs
-
 
 class Trace(eqx.Module):
     """One episode of one policy, as `credo.rollout.record` keeps it: what viewers, films and the

@@ -25,7 +25,6 @@ from credo.learners.sac import SAC
 from credo.learners.td3 import TD3, matd3
 from credo.networks.exploration import GaussianNoise
 from credo.networks.mlp import MLP, Critic
-from credo.networks.mmu import MMU
 from credo.networks.team import JointCritic, Team
 from credo.runs import loop
 from credo.types import NOTHING
@@ -460,15 +459,6 @@ def test_learners_alone_learn_to_meet(name):
 def test_teams_need_a_network_and_learners_for_teams(build, told):
     with pytest.raises(ValueError, match=told):
         build().init(key=jax.random.key(0))
-
-
-def test_recurrent_teams_can_be_evolved_only():
-    recurrent = dataclasses.replace(ALGORITHM, network=Team(trunk=(4,), head=MMU(hidden=2)))
-    with pytest.raises(TypeError, match=r"Team has memory.*evolve without a learner"):
-        recurrent.init(key=jax.random.key(0))
-    rows, _ = run(dataclasses.replace(recurrent, learners=()), 1)
-    assert 0.0 <= rows[0]["fitness_mean"] <= 1.0
-    assert rows[0]["updates"] == 0
 
 
 @pytest.mark.parametrize(

@@ -903,13 +903,41 @@ def test_a_task_of_ones_own_is_trained_and_resumed(credo, own_tasks, tmp_path, m
         assert credo(f"{command} {path}")[0] == 0
 
 
-def test_learners_without_memory_refuse_networks_that_have_it(credo, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for words in ("td3 Pendulum-v1 --network gru", "sac Pendulum-v1 --network mmu"):
-        code, out, err = credo(f"train {words} --frames 60 --in-process True")
-        assert (code, out) == (2, "")
-        assert re.search("credo: .*(network such as|needs an) MLP", err.splitlines()[-1])
-    assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize(
+    "words",
+    [
+        "sac Pendulum-v1 --hide velocities --network gru",
+        "erl passive-tmaze --length 5 --network mmu",
+    ],
+)
+def test_networks_with_memory_are_trained_go_on_and_are_exported(credo, tmp_path, words):
+    """Those of learners are larger than those of evolution."""
+    path, few = tmp_path / "run", "--start-frames" if "sac" in words else "--warmup-frames"
+    how = f"--frames 420 {few} 200 --test-episodes 1 --replay-capacity 1000 --path {path}"
+    code, _, err = credo(f"train {words} {how}")
+    assert code == 0, err
+    run = Run(path)
+    assert run.metrics["updates"].any()
+    assert run.algorithm.network.hidden == 64
+    assert run.algorithm.env.obs_size == 2
+    assert credo(f"resume {path} --frames 840")[0] == 0
+    assert credo(f"evaluate {path} --episodes 1")[0] == 0
+    assert credo(f"export {path} {tmp_path / 'policy.npz'}")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("td3 Pendulum-v1 --hide 7", r"hides entries \(7,\): there are 0 … 2"),
+        ("td3 Pendulum-v1 --hide 0,1,2", "hides all 3 entries"),
+        ("td3 Pendulum-v1 --hide x", "hide is 'x': give numbers of entries"),
+        ("erl passive-tmaze --hide velocities", "not known which observations of PassiveTMaze"),
+    ],
+)
+def test_what_cannot_be_hidden_is_said(credo, words, told):
+    code, out, err = credo(f"train {words} --frames 60")
+    assert (code, out) == (2, "")
+    assert re.search(told, err.splitlines()[-1])
 
 
 def test_a_run_that_ends_before_it_learns_is_mentioned(credo, tmp_path):

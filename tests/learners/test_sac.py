@@ -231,7 +231,7 @@ def test_each_step_draws_anew(start):
 
 
 def test_networks_without_a_mean_to_squash_are_refused():
-    with pytest.raises(TypeError, match="SAC draws actions around.*Graph.*give MLP.*TD3"):
+    with pytest.raises(TypeError, match=r"SAC draws actions around.*Graph.*give MLP.*TD3"):
         SAC().init(Graph(hidden=2), OBS, ACT, key=jax.random.key(0))
 
 

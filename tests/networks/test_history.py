@@ -43,7 +43,7 @@ def made(network):
 
 
 def windows_of(network, policy, seed=0):
-    """Windows, and what is observed in them; what is stored is what such a policy could remember."""
+    """Windows, and what is observed in them; such a policy could remember what they hold."""
     rng, team = np.random.default_rng(seed), (AGENTS,) if network.team else ()
     seen = rng.uniform(-1, 1, (N, LENGTH, *team, OBS)).astype(np.float32)
     memory = []

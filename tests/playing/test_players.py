@@ -54,9 +54,7 @@ def played(env, network, members=7, episodes=2, crew=None, **how):
         return rollout.collect(env, population, episodes, key=jax.random.key(1), **how)
 
 
-def part(
-    env, network, members, episodes=1, record="frames", limit=None, seed=0, wanted=None
-) -> Part:
+def part(env, network, members, episodes=1, record=True, limit=None, seed=0, wanted=None) -> Part:
     """Fresh policies with worlds of their own, as they are asked for."""
     key = jax.random.key(seed)
     population = draw(network, env.sizes, members, key=key)
@@ -93,7 +91,7 @@ def test_their_number_changes_no_bit(env, network, crew):
 def test_no_member_is_alone_and_all_are_there():
     one = {"w": np.arange(7)}
     worlds = np.arange(14, dtype=np.uint32).reshape(7, 2)
-    population = Part(TASK, one, worlds, np.zeros((7, 2, 2), np.uint32), 2, "nothing")
+    population = Part(TASK, one, worlds, np.zeros((7, 2, 2), np.uint32), 2, False)
     champion = dataclasses.replace(population, worlds=np.zeros((1, 5), np.uint32))
     for most in range(1, 9):
         shares = shared([population], most)
@@ -125,9 +123,9 @@ def test_what_is_played_together_has_the_bits_of_what_is_played_alone(task, crew
     network = MLP(hidden=(16,))
     parts = [
         part(task, network, 4, 2, wanted=1),
-        part(task, network, 1, 5, record="nothing", seed=1),
+        part(task, network, 1, 5, record=False, seed=1),
         part(task, network, 1, 2, limit=3, seed=2),
-        part(task, MMU(), 3, record="memory", seed=3),
+        part(task, MMU(), 3, seed=3),
     ]
     alone = [play([one])[0] for one in parts]
     assert same(alone, play(parts))

@@ -63,6 +63,8 @@ TRAIN = {
     "td3": f"td3 {ALONE}",
     "ddpg": f"ddpg {ALONE}",
     "sac": f"sac {ALONE}",
+    "memory": f"sac {ALONE} --network gru --hide velocities --sampling.window 8 "
+    "--sampling.burn-in 2 --learner.batch-size 16",
     "ppo": "ppo InvertedPendulum-v5 --network.hidden 8 --critic.hidden 8 --horizon 100 --copies 4 "
     "--batch-size 20 --epochs 2 --test-episodes 2 --test-every 300 --max-episode-steps 40",
     "matd3": f"matd3 {TEAM_ALONE}",
@@ -83,6 +85,7 @@ GENERATIONS = {  # half of them are enough for seven disturbances
     "td3": 1_400,
     "ddpg": 1_400,
     "sac": 1_200,
+    "memory": 900,
     "ppo": 500,
     "matd3": 120_000,
     "maddpg": 120_000,

@@ -19,7 +19,7 @@ from .. import require, tree
 from ..compilation import float32, jit, repeat
 from ..evolution.breeder import AbstractBreeder, draw
 from ..evolution.selection import rankable, ranking
-from ..learners.base import AbstractLearner, learn
+from ..learners.base import AbstractLearner, learn, require_windows
 from ..learners.coach import AbstractCoach
 from ..learners.credit import AbstractRedistribution
 from ..learners.horizon import AbstractHorizon
@@ -98,6 +98,8 @@ class Hybrid(eqx.Module):
         for name in ("updates_per_frame", "warmup_frames"):
             require.at_least(name, getattr(self, name), 0)
         require.fits(self.env, self.network, *self.learners)
+        if self.learners:
+            require_windows(self.network, self.sampling)
         for reward in (self.fitness, *(learner.signal for learner in self.learners)):
             objective(self.env, reward)
         q = len(self.learners)
@@ -158,7 +160,9 @@ class Hybrid(eqx.Module):
             population=population,
             lineage=Lineage.first(k, q),
             learners=tuple(one.init(network, *env.sizes, key=key) for one, key in pairs),
-            replay=Replay.empty(blank(env, network), self.replay_capacity) if q else None,
+            replay=Replay.empty(blank(env, tree.take(population, 0)), self.replay_capacity)
+            if q
+            else None,
             ledger=Ledger.empty(q),
             allocation=even(self.workers, max(q, 1)),
             champion=frozen(moments, tree.take(population, 0)),
@@ -206,7 +210,6 @@ def play(hybrid: Hybrid, state: HybridState, policies, episodes: int, **how) -> 
     All of a generation act by the moments of those before; learners learn by those with what was
     `seen` since.
     """
-    how |= {"remember": state.replay is not None}
     played, new = collect(hybrid.env, behind(state.moments, policies), episodes, **how)
     return stored(hybrid, state, played, new), played
 

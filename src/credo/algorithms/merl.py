@@ -35,7 +35,7 @@ from jaxtyping import PRNGKeyArray
 from .. import require
 from ..compilation import float32
 from ..evolution.breeder import AbstractBreeder, evolving
-from ..learners.base import AbstractLearner
+from ..learners.base import AbstractLearner, in_windows
 from ..learners.coach import AbstractCoach
 from ..learners.credit import AbstractRedistribution, Even
 from ..learners.horizon import AbstractHorizon
@@ -109,7 +109,8 @@ class MERL(Hybrid):
     @classmethod
     def merl(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The defaults, for the command line. `overrides`: fields of `MERL`, and of its breeder."""
-        return cls(env, network or Team(), **evolving(BREEDER, overrides))
+        settings = in_windows(network, {"learners": (LOCAL,), "updates_per_frame": 0.1})
+        return cls(env, network or Team(), **evolving(BREEDER, settings, overrides))
 
     @classmethod
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
@@ -120,6 +121,7 @@ class MERL(Hybrid):
         settings: dict[str, Any] = {"learners": 3 * (replace(LOCAL, batch_size=32),)}
         settings |= {"population_size": 50, "episodes": 4, "remember": True}
         settings |= {"updates_per_frame": 0.2, "redistribute": Even(late_only=True)}
+        settings = in_windows(network, settings)
         return cls.merl(env, network or Team(sharing="everything"), **settings | overrides)
 
     @classmethod

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require, tree
 from ..compilation import float32
-from ..learners.base import AbstractLearner, learn
+from ..learners.base import AbstractLearner, in_windows, learn, require_windows
 from ..learners.credit import AbstractRedistribution
 from ..learners.decomposed import Decomposed
 from ..learners.sac import HYBRID_NETWORK, SAC, modern
@@ -69,6 +69,7 @@ class OffPolicy(eqx.Module):
         for name in ("episodes", "test_episodes", "test_every", "replay_capacity"):
             require.at_least(name, getattr(self, name), 1)
         require.fits(self.env, self.network, self.learner)
+        require_windows(self.network, self.sampling)
         require.at_least("start_frames", self.start_frames, 0)
         require.at_least("updates_per_frame", self.updates_per_frame, 0)
         objective(self.env, self.learner.signal)
@@ -78,19 +79,20 @@ class OffPolicy(eqx.Module):
         """The constants of TD3's authors, second version; for a team those of `matd3`, with critics
         of each agent's own frames."""
         if env.agents is not None:
-            return cls.matd3(env, network, **{"learner": TD3(**TEAM)} | overrides)
-        return cls(env, network or TD3_NETWORK, **overrides)
+            return cls._team(TD3(**TEAM), env, network, overrides)
+        settings = in_windows(network, {"learner": TD3()})
+        return cls(env, network or TD3_NETWORK, **settings | overrides)
 
     @classmethod
     def ddpg(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of ERL's learner (Khadka 2019, section 5.4)."""
-        settings = {"learner": ddpg(), "start_frames": 1_000}
+        settings = in_windows(network, {"learner": ddpg(), "start_frames": 1_000})
         return cls(env, network or ERL_NETWORK, **settings | overrides)
 
     @classmethod
     def sac(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of SAC's authors, with a learned temperature."""
-        settings = {"learner": SAC(), "start_frames": 10_000}
+        settings = in_windows(network, {"learner": SAC(), "start_frames": 10_000})
         return cls(env, network or TD3_NETWORK, **settings | overrides)
 
     @classmethod
@@ -98,19 +100,23 @@ class OffPolicy(eqx.Module):
         """The learner of `ERL.hybrid` alone, with the same network and the same view of rewards."""
         settings: dict[str, Any] = {"learner": modern(), "start_frames": 5_000}
         settings |= {"redistribute": Decomposed()}
-        return cls(env, network or HYBRID_NETWORK, **settings | overrides)
+        return cls(env, network or HYBRID_NETWORK, **in_windows(network, settings) | overrides)
 
     @classmethod
     def matd3(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """A team, in ten worlds at a time, with the team's constants of MERL."""
-        settings = {"learner": matd3(), "episodes": 10, "start_frames": 5_000}
-        settings |= {"updates_per_frame": 0.1, "replay_capacity": 100_000}
-        return cls(env, network or Team(), **settings | overrides)
+        return cls._team(matd3(), env, network, overrides)
 
     @classmethod
     def maddpg(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """As `matd3`."""
-        return cls.matd3(env, network, **{"learner": maddpg()} | overrides)
+        return cls._team(maddpg(), env, network, overrides)
+
+    @classmethod
+    def _team(cls, learner: TD3, env: Environment, network, overrides: dict[str, Any]) -> Self:
+        settings: dict[str, Any] = {"learner": learner, "episodes": 10, "start_frames": 5_000}
+        settings |= {"updates_per_frame": 0.1, "replay_capacity": 100_000}
+        return cls(env, network or Team(), **in_windows(network, settings) | overrides)
 
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
@@ -132,7 +138,7 @@ class OffPolicy(eqx.Module):
         moments = Moments.first(env, self.network) if self.normalize_observations else None
         return OffPolicyState(
             learner=learner,
-            replay=Replay.empty(blank(env, self.network), self.replay_capacity),
+            replay=Replay.empty(blank(env, self.learner.actor(learner)), self.replay_capacity),
             champion=frozen(moments, self.learner.actor(learner)),
             score=jnp.float32(-jnp.inf),
             frames=jnp.int32(0),
@@ -163,7 +169,7 @@ class OffPolicy(eqx.Module):
         explorer = tree.single(
             self.learner.explorer(state.learner, state.frames < self.start_frames)
         )
-        how = {"common": False, "remember": True, "key": explore_key}
+        how = {"common": False, "key": explore_key}
         explorer = behind(state.moments, explorer)
         played, experience = collect(self.env, explorer, self.episodes, **how)
         moments = watched(state.moments, experience)

@@ -9,7 +9,6 @@ run's record, and the result depends on no clock.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import jax.numpy as jnp
 
@@ -33,11 +32,9 @@ def overlapped(
     play_key, explore_key, learn_key = keys
     state = replace(state, moments=state.seen)
     acting = behind(state.moments, state.population)
-    how: Any = {"remember": True}
-    population, asked = begun(hybrid.env, acting, hybrid.episodes, **how, key=play_key), []
+    population, asked = begun(hybrid.env, acting, hybrid.episodes, key=play_key), []
     for i in range(len(hybrid.learners)):
-        team, theirs = exploring(hybrid, state, i, key=explore_key)
-        how |= theirs
+        team, how = exploring(hybrid, state, i, key=explore_key)
         team = behind(state.moments, team)
         asked.append((how["wanted"], begun(hybrid.env, team, hybrid.workers, **how)))
     players.start()

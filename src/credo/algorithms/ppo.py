@@ -140,7 +140,7 @@ class PPO(eqx.Module):
         actor_key, critic_key = jax.random.split(key)
         mean = self.network.init(env.obs_size, env.action_size, key=actor_key)
         actor = Actor(mean, jnp.full(env.action_size, jnp.log(self.first_std)))
-        values = remembering(self.critic) if self.network.remembers else self.critic
+        values = self.critic if mean.first() is None else remembering(self.critic)
         critic = values.init(env.obs_size, 0, key=critic_key)  # a value of states
         # Room for a round of episodes that are all much longer than the last ones.
         most = min(self.copies * env.max_steps, self.horizon + 8 * env.max_steps)
@@ -149,7 +149,7 @@ class PPO(eqx.Module):
             actor=actor,
             critic=critic,
             optimizer=adam_state((actor, critic)),
-            replay=Replay.empty(blank(env), most),
+            replay=Replay.empty(blank(env, mean), most),
             champion=frozen(moments, mean),
             score=jnp.float32(-jnp.inf),
             length=jnp.float32(min(self.horizon, env.max_steps)),
@@ -255,7 +255,7 @@ def prepare(ppo: PPO, networks: Networks, replay: Replay, moments: Moments | Non
     obs, next_obs = seen(moments, rows.obs), seen(moments, rows.next_obs)
     over = rows.terminated | rows.truncated
     before: Any = {}
-    if jax.tree.leaves(jax.eval_shape(lambda: actor.mean.start(key=jax.random.key(0)))):
+    if rows.memory is not None:
         begins = jnp.append(True, over[:-1])
         means, value, after, memories = _told_in_order(networks, obs, next_obs, begins)
         before = {"counts": filled, "begins": begins, "memories": memories}

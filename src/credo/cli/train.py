@@ -35,6 +35,9 @@ class Train:
     """Settings to start from, one of `credo list presets`. None: the published ones."""
     delayed: bool = False
     """Pay the whole return of an episode at its last step, and nothing before."""
+    hide: str | None = None
+    """Entries of an observation that the policy does not see, counted from 0, as in 2,3; or
+    velocities, of tasks of which these are known. None: it sees all."""
     from_: str | None = None
     """Warm start: the folder of a run whose policy this one starts from. Task and network must have
     the same sizes. None: new weights."""
@@ -122,6 +125,10 @@ def algorithm_of(line: Line, command: Train) -> Any:
     line.reserved |= fields
     env = _task(line, command)
     network = _network(line, command.network or ALGORITHMS[word].get("network"), word, env)
+    if command.hide:
+        from ..environments.hidden import hidden
+
+        env = hidden(env, command.hide)
     if command.delayed:
         from ..environments import wrappers
 
@@ -173,7 +180,10 @@ def _network(line: Line, name: str | None, algorithm: str, env: Any) -> Any:
         return None
     if name not in NETWORKS:
         fail(f"no network {name!r}", name, NETWORKS)
-    network = load(NETWORKS[name]["path"])(**NETWORKS[name].get("fields", {}))
+    fields = NETWORKS[name].get("fields", {})
+    if ALGORITHMS[algorithm].get("gradient"):
+        fields = fields | NETWORKS[name].get("gradient", {})
+    network = load(NETWORKS[name]["path"])(**fields)
     if env.agents is not None and not network.team and algorithm != "ccea":
         from ..networks.team import Team
 

@@ -1,5 +1,6 @@
 """Tasks made of other tasks."""
 
+import abc
 import dataclasses
 import threading
 from typing import Any
@@ -201,14 +202,11 @@ class DelayedReward(AbstractWrapper):
         return DelayedState(inner, earned), dataclasses.replace(now, rewards=paid)
 
 
-class DelayedHostReward(AbstractHostEnvironment):
-    """The same for a task outside JAX. Its copies are those of `env`: play one at a time."""
+class AbstractHostWrapper(AbstractHostEnvironment):
+    """A task outside JAX with the sizes and the rewards of another one. Its copies are those of
+    `env`: play one at a time."""
 
-    env: AbstractHostEnvironment  # the task whose reward comes late
-
-    def __check_init__(self):
-        if not isinstance(self.env, AbstractHostEnvironment):
-            raise ValueError(f"{type(self.env).__name__} is no host task: use delayed(env)")
+    env: AbstractHostEnvironment  # the wrapped task
 
     obs_size = _of("env", "obs_size")
     action_size = _of("env", "action_size")
@@ -225,19 +223,39 @@ class DelayedHostReward(AbstractHostEnvironment):
     warnings = _of("env", "warnings")
     task_record = _of("env", "task_record")
 
-    def copies(self, n: int) -> "DelayedCopies":
-        inner = self.env.copies(n)
-        kept = _DELAYED.copies
+    def copies(self, n: int) -> Any:
+        inner, kept = self.env.copies(n), _KEPT.copies
         if (self, n) not in kept or kept[self, n].inner is not inner:
-            kept[self, n] = DelayedCopies(inner, self.reward_shapes)
+            kept[self, n] = self.around(inner)
         return kept[self, n]
 
+    @abc.abstractmethod
+    def around(self, inner: AbstractCopies) -> "AbstractWrappedCopies":
+        """Copies that play these."""
 
-class DelayedCopies(AbstractCopies):
-    """Copies whose rewards are paid at the last step of each episode."""
 
+class AbstractWrappedCopies(AbstractCopies):
+    """Copies around others."""
+
+    inner: AbstractCopies
     failed = _of("inner", "failed")
+    spoiled = _of("inner", "spoiled")
     failure_text = _of("inner", "failure_text")
+
+
+class DelayedHostReward(AbstractHostWrapper):
+    """`DelayedReward` for a task outside JAX."""
+
+    def __check_init__(self):
+        if not isinstance(self.env, AbstractHostEnvironment):
+            raise ValueError(f"{type(self.env).__name__} is no host task: use delayed(env)")
+
+    def around(self, inner: AbstractCopies) -> "DelayedCopies":
+        return DelayedCopies(inner, self.reward_shapes)
+
+
+class DelayedCopies(AbstractWrappedCopies):
+    """Copies whose rewards are paid at the last step of each episode."""
 
     def __init__(self, inner: AbstractCopies, shapes: dict[str, tuple[int, ...]]):
         self.inner, self.n = inner, inner.n
@@ -263,7 +281,7 @@ class _Kept(threading.local):
     """Of each thread its own, as the copies inside are."""
 
     def __init__(self):
-        self.copies: dict[tuple[DelayedHostReward, int], DelayedCopies] = {}
+        self.copies: dict[tuple[AbstractHostWrapper, int], AbstractWrappedCopies] = {}
 
 
-_DELAYED = _Kept()
+_KEPT = _Kept()

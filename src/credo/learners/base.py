@@ -18,8 +18,8 @@ from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.history import by_row, unrolled
 from ..networks.history import moments as seen_in
 from ..normalization import seen
-from ..replay import UNIFORM, Replay
-from ..types import NOTHING, Batch, Metrics, Transition
+from ..replay import UNIFORM, Replay, Sampling
+from ..types import NOTHING, Batch, Metrics
 
 Learned = tuple[PyTree, Metrics]  # state and metrics
 Returns = Float[Array, "samples batch *agents"]
@@ -49,6 +49,11 @@ class AbstractLearner(eqx.Module):
         """Whether the agents of a team learn from the same frames; else each draws its own."""
         return False
 
+    def at_once(self, state: PyTree) -> bool:
+        """Whether the agents of a team learn from the frames of one moment, as it, or as its actor,
+        has to."""
+        return self.together or self.actor(state).together
+
     @abc.abstractmethod
     def update(self, state: PyTree, batch: Batch, *, key: PRNGKeyArray) -> tuple[PyTree, Metrics]:
         """One gradient step on one minibatch."""
@@ -71,6 +76,24 @@ class AbstractLearner(eqx.Module):
         """`state` that goes on from a given actor."""
 
 
+def in_windows(network: AbstractNetwork | None, settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings of an algorithm with its `learner`, or `learners`, for a network that may have
+    memory: minibatches of at least 1,024 rows, which are 16 windows of 64, and four frames to an
+    update, which costs ten times as much as without memory."""
+    if network is None or not network.remembers:
+        return settings
+
+    def larger(learner: Any) -> Any:
+        return replace(learner, batch_size=max(learner.batch_size, 1024))
+
+    found = dict(settings)
+    if "learner" in found:
+        found["learner"] = larger(found["learner"])
+    if "learners" in found:
+        found["learners"] = tuple(map(larger, found["learners"]))
+    return found | {"updates_per_frame": min(found.get("updates_per_frame", 1.0), 0.25)}
+
+
 def learn(learner: AbstractLearner, state, replay: Replay, updates, **rest) -> Learned:
     """`updates` gradient steps, each on a minibatch of its own, in one program. Their number is
     data.
@@ -90,12 +113,13 @@ def learn(learner: AbstractLearner, state, replay: Replay, updates, **rest) -> L
 def _learn(learner, state, replay: Replay, updates, *, signal, key, **how):
     signal = learner.signal or signal
     learner = learner if learner.reward_scale is not None else scaled(learner, replay, signal)
+    how |= {"signal": signal, "together": learner.at_once(state)}
     dynamic, static = eqx.partition(state, eqx.is_array)
 
     def body(i, loop):
         dynamic, total = loop
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
-        batch = minibatch(learner, replay, signal=signal, **how, key=sample_key)
+        batch = minibatch(learner, replay, **how, key=sample_key)
         state, metrics = learner.update(eqx.combine(dynamic, static), batch, key=update_key)
         return eqx.filter(state, eqx.is_array), jax.tree.map(jnp.add, total, metrics)
 
@@ -104,27 +128,14 @@ def _learn(learner, state, replay: Replay, updates, *, signal, key, **how):
     return eqx.combine(dynamic, static), averaged(total, updates)
 
 
-def minibatch(learner, replay: Replay, *, signal, moments=None, sampling=UNIFORM, key) -> Batch:
-    """What a learner learns from in one step. Arguments as of `learn`."""
-    if replay.data.memory is not None:
-        return _in_windows(learner, replay, signal, moments, sampling, key)
-    given = (learner.batch_size, sampling, learner.gamma)
-    rows, discount = replay.sample(*given, together=learner.together, key=key)
-    return _batch(rows, signal, moments, rows.active, discount)
-
-
-def _batch(rows: Transition, signal: str, moments: Any, *rest: Any) -> Batch:
+def minibatch(learner, replay: Replay, *, signal, moments=None, sampling=UNIFORM, **how) -> Batch:
+    """What a learner learns from in one step. Arguments as of `learn`; `how`: `together`, as
+    `AbstractLearner.at_once` says, and `key`."""
+    drawn: Any = replay.sample if replay.data.memory is None else replay.windows
+    rows, *about = drawn(learner.batch_size, sampling, learner.gamma, **how)
     reward, ends = rows.rewards[signal], (rows.terminated, rows.truncated)
     obs, after = seen(moments, rows.obs), seen(moments, rows.next_obs)
-    return Batch(obs, rows.action, reward, after, *ends, *rest)
-
-
-def _in_windows(learner, replay: Replay, signal, moments, sampling, key) -> Batch:
-    """About as many rows that count, in windows."""
-    n = max(round(learner.batch_size / sampling.window), 1)
-    rows, windows, counts = replay.windows(n, sampling, together=learner.together, key=key)
-    counts = counts if rows.active is None else counts & rows.active
-    return _batch(rows, signal, moments, counts, None, windows)
+    return Batch(obs, rows.action, reward, after, *ends, rows.active, *about)
 
 
 def scaled(learner: Any, replay: Replay, signal: str) -> Any:
@@ -196,7 +207,7 @@ def _mean_where(x: Array, active: Array) -> Array:
 def acts(policy: AbstractPolicy, batch: Batch, later: bool = False) -> Array:
     """What a policy does in the rows of a batch, or after them: `[batch, *agents, act]`."""
     if batch.windows is None:
-        return act(policy, batch.observations(later))
+        return act(policy, batch.next_obs if later else batch.obs)
     return by_row(unrolled(policy, seen_in(batch, later), batch.windows), later)
 
 
@@ -206,6 +217,15 @@ def act(policy: AbstractPolicy, obs: Float[Array, "batch *agents obs"]) -> Array
         return policy(obs.T, policy.start(key=None))[0].T  # pyright: ignore[reportArgumentType]
     start = policy.start(key=jax.random.key(0))
     return jax.vmap(lambda x: policy(x, start)[0])(obs)
+
+
+def require_windows(network: AbstractNetwork, sampling: Sampling) -> None:
+    """Raise if minibatches for a network with memory are asked for that there are not."""
+    if sampling.steps > 1 and network.remembers:
+        raise ValueError(
+            f"steps is {sampling.steps} and {type(network).__name__} has memory, which learns from "
+            "returns of one step: give steps=1, or a network without memory"
+        )
 
 
 def require_critic(asked: Any, learners: tuple[AbstractLearner, ...]) -> None:

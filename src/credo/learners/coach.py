@@ -82,6 +82,7 @@ class Coached(AbstractCoach):
 def _moved(rate, learner, state, members, replay, steps, *, key: PRNGKeyArray, **how) -> PyTree:
     """One member after the other, each on minibatches of its own."""
     arrays, static = eqx.partition(members, eqx.is_array)
+    how |= {"together": learner.at_once(state)}
 
     def loss(member, batch):
         return -mean(learner.value(state, member, batch), batch.active), None

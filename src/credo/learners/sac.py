@@ -67,8 +67,8 @@ class StochasticActor(eqx.Module):
     ) -> tuple[Float[Array, "act batch"], Float[Array, " batch"]]:
         """Actions in the rows of a batch, or in what follows them, and their log probability
         density."""
-        obs = batch.observations(later)
         if batch.windows is None:
+            obs = batch.next_obs if later else batch.obs
             features, mean, _ = self.mean.spoken(obs.T, ())
         else:
             seen = moments(batch, later)
@@ -173,7 +173,7 @@ class SAC(AbstractLearner):
         initializer = getattr(network, "initializer", "uniform")
         head = draw_layers((units, action_size), initializer, key=head_key)
         actor = StochasticActor(mean, head, steepness)
-        critic = remembering(self.critic) if network.remembers else self.critic
+        critic = self.critic if mean.first() is None else remembering(self.critic)
         critics = tuple(
             critic.init(obs_size, action_size, key=key)
             for key in jax.random.split(critic_key, self.critics)

@@ -61,6 +61,7 @@ class Preselection(AbstractSurrogate):
 
     def __call__(self, learner, state, members, replay, *, key: PRNGKeyArray, **how):
         asked = replace(learner, batch_size=self.states)
+        how |= {"together": learner.at_once(state)}
         batch = minibatch(asked, replay, key=key, **how)
         arrays, static = eqx.partition(members, eqx.is_array)
 

@@ -63,7 +63,7 @@ class TD3State(eqx.Module):
     actor_opt: optax.OptState
     critic_opt: optax.OptState
     step: Int[Array, ""]
-    agents: tuple[int, ...] = eqx.field(static=True)  # of a team how many
+    shape: tuple[int, ...] = eqx.field(static=True)  # of an action; of a team (agents, act)
 
 
 class TD3(AbstractLearner):
@@ -111,14 +111,14 @@ class TD3(AbstractLearner):
     def init(self, network: AbstractNetwork, *sizes: int, key: Key) -> TD3State:
         actor_key, critic_key = jax.random.split(key)
         actor = network.init(*sizes, key=actor_key)
-        critic = remembering(self.critic) if network.remembers else self.critic
+        critic = self.critic if actor.first() is None else remembering(self.critic)
         if isinstance(actor, MLPPolicy | TeamPolicy):
             actor = actor.scaled(self.actor_scale)
         seen = sizes if self.together else sizes[:2]
         keys = jax.random.split(critic_key, self.critics)
         critics = tuple(critic.init(*seen, key=key) for key in keys)
         opts = (adam_state(actor), adam_state(critics))
-        return TD3State(actor, critics, actor, critics, *opts, jnp.int32(0), sizes[2:])
+        return TD3State(actor, critics, actor, critics, *opts, jnp.int32(0), (*sizes[2:], sizes[1]))
 
     def update(self, state: TD3State, batch: Batch, *, key: Key) -> tuple[TD3State, Metrics]:
         given = (state.critics, batch, self.bellman_target(state, batch, key=key))
@@ -134,7 +134,7 @@ class TD3(AbstractLearner):
         due = state.step % self.policy_delay == 0
         after = jax.lax.cond(due, moved, lambda: before) if self.policy_delay > 1 else moved()
         actor, opt, target, targets = after
-        state = TD3State(actor, critics, target, targets, opt, opts, state.step + 1, state.agents)
+        state = TD3State(actor, critics, target, targets, opt, opts, state.step + 1, state.shape)
         return state, {"critic_loss": loss, "q": q}
 
     def bellman_target(self, state: TD3State, batch: Batch, *, key: Key) -> Returns:
@@ -144,8 +144,9 @@ class TD3(AbstractLearner):
         noise = jnp.clip(noise, -self.target_noise_clip, self.target_noise_clip)
         action = acts(state.target_actor, batch, later=True)
         action = features_first(jnp.clip(action + noise, -1.0, 1.0))
-        targets = state.target_critics
-        atoms = jnp.stack([one.atoms(one.sees(batch, later=True), action) for one in targets])
+        atoms = jnp.stack(
+            [q.atoms(q.sees(batch, later=True), action) for q in state.target_critics]
+        )
         ended = batch.terminated | (batch.truncated & (not self.bootstrap_truncated))
         return bellman(self, batch, state.target_critics[0].values.cautious(atoms), ended)
 
@@ -153,8 +154,7 @@ class TD3(AbstractLearner):
         return state.actor
 
     def explorer(self, state: TD3State, random: Bool[Array, ""]) -> AbstractPolicy:
-        shape = (*state.agents, state.critics[0].action_size)
-        return Explorer(state.actor, self.noise, random, shape)
+        return Explorer(state.actor, self.noise, random, state.shape)
 
     def value(self, state: TD3State, policy: AbstractPolicy, batch: Batch) -> Value:
         """By the first critic, which the actor follows too."""
@@ -191,8 +191,7 @@ def maddpg(**fields: Any) -> TD3:
 def critic_error(critics: Critics, batch: Batch, target: Returns) -> tuple[Array, Array]:
     """Sum over critics of the mean Bellman error, squared unless their `values` say otherwise, and
     their mean value."""
-    action = features_first(batch.action)
-    atoms = [(critic.values, critic.atoms(critic.sees(batch), action)) for critic in critics]
+    atoms = [(q.values, q.atoms(q.sees(batch), features_first(batch.action))) for q in critics]
     errors = [mean(values.error(x, target), batch.active) for values, x in atoms]
     values = [mean(values.mean(x), batch.active) for values, x in atoms]
     return jnp.sum(jnp.stack(errors)), jnp.mean(jnp.stack(values))

@@ -43,6 +43,9 @@ class AbstractPolicy(eqx.Module):
 
     features_first: ClassVar[bool] = False
     """Whether weights and activations may carry further axes behind their own."""
+    together: ClassVar[bool] = False
+    """Whether agents of a team share more than weights, so that what one does depends on the
+    others' observations: they can only learn from the frames of one moment."""
 
     @abc.abstractmethod
     def start(self, *, key: PRNGKeyArray) -> PyTree:
@@ -61,8 +64,12 @@ class AbstractPolicy(eqx.Module):
     def remembered(self, carry: PyTree) -> Float[Array, "*agents memory"] | None:
         """What a carry holds, as a vector that a replay buffer keeps; None if that is nothing. Of a
         team each agent's, with what all of them share in each."""
-        numbers = [x for x in jax.tree.leaves(carry) if eqx.is_inexact_array(x)]
+        numbers = jax.tree.leaves(eqx.filter(carry, eqx.is_inexact_array))
         return jnp.concatenate([x.reshape(-1) for x in numbers]) if numbers else None
+
+    def first(self) -> Float[Array, "*agents memory"] | None:
+        """What it remembers at the start of an episode."""
+        return self.remembered(self.start(key=jax.random.key(0)))
 
     def recalled(self, memory: Float[Array, "*agents memory"], *, key: PRNGKeyArray) -> PyTree:
         """The carry that holds a vector of `remembered`; `key` is for what it draws."""
@@ -84,18 +91,9 @@ class AbstractNetwork(eqx.Module):
     @property
     def remembers(self) -> bool:
         """Whether its policies have memory."""
-        sizes = (2, 1, 2) if self.team else (2, 1)
-
-        def carry():
-            return self.init(*sizes, key=jax.random.key(0)).start(key=jax.random.key(0))
-
-        return bool(jax.tree.leaves(jax.eval_shape(carry)))
-
-    @property
-    def together(self) -> bool:
-        """Whether agents of a team share more than weights, so that their frames must be those of
-        one moment."""
-        return False
+        sizes = (2, 1, *(2,) * self.team)
+        first = jax.eval_shape(lambda: self.init(*sizes, key=jax.random.key(0)).first())
+        return first is not None
 
     @abc.abstractmethod
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> AbstractPolicy:

@@ -93,10 +93,6 @@ class DMMU(AbstractNetwork):
         return True
 
     @property
-    def together(self) -> bool:
-        return True
-
-    @property
     def cells(self) -> int:
         if self.memory is not None:
             return self.memory
@@ -155,6 +151,8 @@ class DMMUCarry(eqx.Module):
 class DMMUPolicy(AbstractPolicy):
     """One MMU per agent. A leaf is a matrix of one agent, so that operators on genomes see what is
     published."""
+
+    together: ClassVar[bool] = True
 
     agents: tuple[MMUPolicy | RecurrentPolicy, ...]
     config: DMMU = eqx.field(static=True)

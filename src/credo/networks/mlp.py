@@ -113,7 +113,7 @@ class AbstractCriticNetwork(eqx.Module):
 
     def sees(self, batch: Batch, later: bool = False) -> Float[Array, "obs batch *agents"]:
         """What it sees of the rows of a batch, or of what follows them: what `atoms` takes."""
-        return features_first(batch.observations(later))
+        return features_first(batch.next_obs if later else batch.obs)
 
     @abc.abstractmethod
     def atoms(

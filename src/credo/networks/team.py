@@ -172,10 +172,6 @@ class Centralized(AbstractNetwork):
 
     network: AbstractNetwork = MLP(hidden=(300,))  # the network that acts for all agents
 
-    @property
-    def together(self) -> bool:
-        return True
-
     def init(
         self, obs_size: int, action_size: int, agents: int = 1, *, key: PRNGKeyArray
     ) -> "CentralizedPolicy":
@@ -184,6 +180,8 @@ class Centralized(AbstractNetwork):
 
 
 class CentralizedPolicy(AbstractPolicy):
+    together: ClassVar[bool] = True
+
     policy: AbstractPolicy  # of everybody
     agents: int = eqx.field(static=True)
 

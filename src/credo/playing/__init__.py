@@ -8,7 +8,7 @@ processes, and played again where one of these died.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,8 +18,6 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, UInt32
 
 from ..environments.host import AbstractHostEnvironment, Episodes
 
-Record = Literal["nothing", "frames", "memory"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Part:
@@ -27,7 +25,7 @@ class Part:
 
     `policies`: the data of a key for each episode, by which a policy starts. Of its episodes each
     member plays the first `wanted`, of `limit` steps at most; None: as many as the task has.
-    `record`: what is kept of a step, nothing, the transition, or with it the policy's memory.
+    `record`: whether transitions are kept.
     """
 
     env: AbstractHostEnvironment
@@ -35,7 +33,7 @@ class Part:
     worlds: UInt32[np.ndarray, "members episodes"]
     policies: UInt32[np.ndarray, "members episodes 2"]
     wanted: int
-    record: Record
+    record: bool
     limit: int | None = None
 
 
@@ -60,8 +58,8 @@ class _Group:
         self._start = start(self._form, self._arrays, jnp.asarray(part.policies))
         _, actions, *team = part.env.sizes
         self._idle = np.zeros((part.worlds.size, *team, actions), np.float32)
+        self.record, self.memory = part.record, None  # what was remembered before the last step
         self.begin()
-        self.remembers = part.record == "memory" and self.memory() is not None
 
     def begin(self) -> None:
         """The memories with which a turn begins."""
@@ -71,20 +69,16 @@ class _Group:
         """Actions of its lanes, which may still be under way; zeros where none is active."""
         if not active[self.lanes].any():
             return self._idle
-        action, self._carry = act(self._form, self._arrays, obs[self.lanes], self._carry)
+        given = (self._form, self._arrays, obs[self.lanes], self._carry, self.record)
+        action, self._carry, self.memory = act(*given)
         return action
-
-    def memory(self) -> np.ndarray | None:
-        """What the policies of its lanes remember; None: nothing."""
-        found = remembered(self._form, self._arrays, self._carry)
-        return None if found is None else np.asarray(found)
 
 
 def play(parts: Sequence[Part]) -> list[Outcome]:
     """Play parts of one task here. All take each step together, so that it is asked once."""
     env, sizes = parts[0].env, [part.worlds.size for part in parts]
     groups = [_Group(part, sum(sizes[:i])) for i, part in enumerate(parts)]
-    record = np.repeat([part.record != "nothing" for part in parts], sizes)
+    record = np.repeat([part.record for part in parts], sizes)
     limits = [env.max_steps if part.limit is None else part.limit for part in parts]
     told = Episodes(env, sum(sizes), record, np.repeat(limits, sizes))
     wanted = [np.tile(np.arange(p.worlds.shape[1]) < p.wanted, len(p.worlds)) for p in parts]
@@ -94,35 +88,32 @@ def play(parts: Sequence[Part]) -> list[Outcome]:
         for group in groups:
             group.begin()
         while told.ongoing:
-            memory = _memory(groups)
             actions = [group.act(obs, told.active) for group in groups]
             actions = np.concatenate(actions) if len(groups) > 1 else np.asarray(*actions)
-            obs = told.advance(actions, memory)
+            obs = told.advance(actions, _memory(groups))
         if told.again.any():
             turns.append(told.again)
     return [_outcome(part, told, group) for part, group in zip(parts, groups, strict=True)]
 
 
 def _memory(groups: Sequence[_Group]) -> np.ndarray | None:
-    """What the policies of all lanes remember; zeros where nobody wants to know, and None if there
-    is nothing."""
-    found = [group.memory() if group.remembers else None for group in groups]
-    shape = next((x.shape[1:] for x in found if x is not None), None)
+    """What the policies of all lanes remembered before a step; zeros of those that are not
+    recorded, and None if there is nothing."""
+    shape = next((group.memory.shape[1:] for group in groups if group.memory is not None), None)
     if shape is None:
         return None
-    unasked = (
-        np.zeros((group.lanes.stop - group.lanes.start, *shape), np.float32) for group in groups
-    )
-    return np.concatenate([z if x is None else x for x, z in zip(found, unasked, strict=True)])
+    none = [np.zeros((x.lanes.stop - x.lanes.start, *shape), np.float32) for x in groups]
+    pairs = zip(groups, none, strict=True)
+    return np.concatenate([zero if x.memory is None else x.memory for x, zero in pairs])
 
 
 def _outcome(part: Part, told: Episodes, group: _Group) -> Outcome:
     """What came of a group's lanes."""
-    lanes, remembers = group.lanes, group.remembers
+    lanes = group.lanes
     shape = part.worlds.shape
     returns = {name: x[lanes].reshape(*shape, *x.shape[1:]) for name, x in told.returns().items()}
-    rows = told.rows(lanes) if part.record != "nothing" else None
-    if rows is not None and not remembers:  # others, who were played beside it, did
+    rows = told.rows(lanes) if part.record else None
+    if rows is not None and group.memory is None:  # others did, who were played beside it
         rows = (*rows[:-1], None)
     return Outcome(returns, told.steps[lanes].reshape(shape), rows)
 
@@ -226,23 +217,15 @@ def start(form: Form, arrays, policies: Array):
     return started(form.filled(arrays), jax.random.wrap_key_data(policies))
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def act(form: Form, arrays, obs: Array, carry: PyTree):
-    """Actions, one lane behind the other, and carries."""
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def act(form: Form, arrays, obs: Array, carry: PyTree, record: bool = False):
+    """Actions, one lane behind the other, carries, and what was remembered before, if that is to be
+    recorded and anything was."""
     pop = next(x.shape[0] for x in arrays if x is not None)
     obs = obs.reshape(pop, -1, *obs.shape[1:]).astype(jnp.float32)
-    actions, carry = acted(form.filled(arrays), obs, carry)
-    return actions.reshape(-1, *actions.shape[2:]), carry
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def remembered(form: Form, arrays, carry: PyTree) -> Array | None:
-    """What policies remember, one lane behind the other; None: nothing."""
-    if not jax.tree.leaves(carry):
-        return None
-    told = eqx.filter_vmap(lambda p, own: jax.vmap(p.remembered)(own))
-    memory = told(form.filled(arrays), carry)
-    return None if memory is None else memory.reshape(-1, *memory.shape[2:])
+    actions, carry, memory = acted(form.filled(arrays), obs, carry)
+    actions, memory = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (actions, memory))
+    return actions, carry, memory if record else None
 
 
 def world_keys(pop: int, episodes: int, common: bool, *, key: PRNGKeyArray) -> PRNGKeyArray:
@@ -265,7 +248,9 @@ def started(population: PyTree, keys: PRNGKeyArray) -> PyTree:
 
 
 def acted(population: PyTree, obs: Float[Array, "pop episodes obs"], carries: PyTree):
-    """Actions and carries of all lanes."""
-    return eqx.filter_vmap(
-        lambda p, obs, carries: jax.vmap(lambda x, carry: p(x, carry))(obs, carries)
-    )(population, obs, carries)
+    """Actions and next carries of all lanes, and what they remembered before."""
+
+    def one(policy, obs, carries):
+        return jax.vmap(lambda x, own: (*policy(x, own), policy.remembered(own)))(obs, carries)
+
+    return eqx.filter_vmap(one)(population, obs, carries)

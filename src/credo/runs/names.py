@@ -31,12 +31,14 @@ def _hybrid_word(algorithm: Mapping[str, Any], learners: int) -> str:
 
 def task_word(env: Mapping[str, Any]) -> str:
     """A task's id in Gymnasium or PettingZoo without its package, or the name of its class; with
-    `-delayed` where its reward comes at the end of an episode."""
-    delayed = ""
+    `-delayed` where its reward comes at the end of an episode, `-hidden` where a part of it is not
+    seen."""
+    told = ""
     while "env" in env:  # a wrapper
-        delayed = "-delayed" if _class(env).startswith("Delayed") else delayed
+        known = [name for name in ("Delayed", "Hidden") if _class(env).startswith(name)]
+        told = "".join(f"-{name.lower()}" for name in known) + told
         env = env["env"]
-    return str(env.get("id") or _class(env)).rpartition(":")[2] + delayed
+    return str(env.get("id") or _class(env)).rpartition(":")[2] + told
 
 
 def _learner_word(learner: Mapping[str, Any]) -> str:
