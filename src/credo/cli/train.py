@@ -38,6 +38,8 @@ class Train:
     hide: str | None = None
     """Entries of an observation that the policy does not see, counted from 0, as in 2,3; or
     velocities, of tasks of which these are known. None: it sees all."""
+    last_step: bool = False
+    """Observations end with the last action and the last reward, zeros at the start."""
     from_: str | None = None
     """Warm start: the folder of a run whose policy this one starts from. Task and network must have
     the same sizes. None: new weights."""
@@ -129,6 +131,10 @@ def algorithm_of(line: Line, command: Train) -> Any:
         from ..environments.hidden import hidden
 
         env = hidden(env, command.hide)
+    if command.last_step:
+        from ..environments.last_step import with_last_step
+
+        env = with_last_step(env)
     if command.delayed:
         from ..environments import wrappers
 

@@ -49,6 +49,7 @@ EXPERIMENTS = {
     "hybrid-late": "when does a hybrid win? The return at the last step",
     "hybrid-learner": "the hybrid's learner, one ingredient changed at a time",
     "hybrid-ingredients": "the hybrid, one ingredient changed at a time",
+    "memory-learned": "memory by evolution, by gradient and by both",
     "check-spread": "MADDPG and MATD3 on simple_spread",
 }
 
@@ -72,6 +73,7 @@ MODULES = {  # of this folder, with the experiments that each has
     "paths": ("fig-7.5",),
     "hybrids": ("hybrid-dense", "hybrid-late"),
     "ingredients": ("hybrid-learner", "hybrid-ingredients"),
+    "recurrent": ("memory-learned",),
     "check_spread": ("check-spread",),
 }
 

@@ -124,7 +124,7 @@ class HistoryCritic(AbstractCritic):
     """Config of a critic with a memory of what was observed and done."""
 
     critic: AbstractCritic = Critic()  # what values memory, observation and action
-    memory: AbstractNetwork = Recurrent(cell="gru", hidden=64, initializer="fan_in")
+    memory: AbstractNetwork = Recurrent("gru", 64, "tanh", "fan_in", span=128)
     """The network that remembers: any with memory, for one agent. Of a team there is one for all,
     and each agent's memory is of its own history."""
     units: int = eqx.field(static=True, default=32)

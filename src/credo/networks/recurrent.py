@@ -8,6 +8,7 @@ States start at zero. One leaf per matrix, so that evolution treats them as it t
 from typing import ClassVar, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -35,10 +36,18 @@ class Recurrent(AbstractNetwork):
     """Activation of the output layer."""
     initializer: str = eqx.field(static=True, default="normal")
     """Fresh weights: normal, fan_in or kaiming."""
+    span: int = eqx.field(static=True, default=0)
+    """Steps for which fresh units of a gru or lstm keep their state, from 1 to nearly so many; at
+    least 3. Chrono initialization (Tallec & Ollivier 2018, "Can recurrent neural networks warp
+    time?", equation 16). 0: gates are as drawn, and keep it for a few steps."""
 
     def __check_init__(self):
         require.literals(self)
         require.at_least("hidden", self.hidden, 1)
+        if self.span != 0:
+            require.at_least("span", self.span, 3)
+            if self.cell == "rnn":
+                raise ValueError("span is for gru and lstm: an rnn has no gates, give span=0")
         require.choice("initializer", self.initializer, INITIALIZERS)
 
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> "RecurrentPolicy":
@@ -47,7 +56,12 @@ class Recurrent(AbstractNetwork):
         for gate in GATES[self.cell]:
             shapes |= {f"W_{gate}": (h, obs_size), f"U_{gate}": (h, h), f"b_{gate}": (h,)}
         shapes |= {"Z_y": (action_size, h), "b_y": (action_size,)}
-        return RecurrentPolicy(draw(shapes, self.initializer, key=key), self)
+        weights = draw(shapes, self.initializer, key=key)
+        if self.span:
+            u = jax.random.uniform(jax.random.fold_in(key, 1), (h,))
+            kept = jnp.log(1.0 + u * (self.span - 2))  # log U([1, span - 1])
+            weights |= {"b_z": kept} if self.cell == "gru" else {"b_f": kept, "b_i": -kept}
+        return RecurrentPolicy(weights, self)
 
 
 class RecurrentPolicy(AbstractPolicy):

@@ -39,7 +39,7 @@ class Team(AbstractNetwork):
     trunk: tuple[int, ...] = eqx.field(static=True, default=(100, 100))
     """Units of each layer that agents share, at least 1."""
     head: AbstractNetwork = MLP(hidden=(), initializer="uniform")
-    """What stands on the trunk; with memory, such as MMU, it can be evolved only."""
+    """What stands on the trunk: MLP, or a network with memory, such as MMU."""
     sharing: Literal["trunk", "everything", "nothing"] = eqx.field(static=True, default="trunk")
     """What agents share: trunk, everything or nothing."""
     activation: str = eqx.field(static=True, default="tanh")  # activation of the trunk

@@ -58,8 +58,17 @@ class _Group:
         self._start = start(self._form, self._arrays, jnp.asarray(part.policies))
         _, actions, *team = part.env.sizes
         self._idle = np.zeros((part.worlds.size, *team, actions), np.float32)
-        self.record, self.memory = part.record, None  # what was remembered before the last step
+        self.memory = self._nothing(part) if part.record else None
+        """What its policies remembered before the last step; None: nothing ever."""
         self.begin()
+
+    def _nothing(self, part: Part) -> np.ndarray | None:
+        """What they remember, as zeros."""
+        first = jax.eval_shape(
+            lambda arrays: eqx.filter_vmap(lambda one: one.first())(self._form.filled(arrays)),
+            self._arrays,
+        )
+        return first and np.zeros((part.worlds.size, *first.shape[1:]), first.dtype)
 
     def begin(self) -> None:
         """The memories with which a turn begins."""
@@ -69,7 +78,8 @@ class _Group:
         """Actions of its lanes, which may still be under way; zeros where none is active."""
         if not active[self.lanes].any():
             return self._idle
-        given = (self._form, self._arrays, obs[self.lanes], self._carry, self.record)
+        remembers = self.memory is not None
+        given = (self._form, self._arrays, obs[self.lanes], self._carry, remembers)
         action, self._carry, self.memory = act(*given)
         return action
 

@@ -7,6 +7,8 @@ legends of pages say the same, whoever started the run. Nothing here imports JAX
 from collections.abc import Mapping
 from typing import Any
 
+WRAPPERS = {"Delayed": "delayed", "Hidden": "hidden", "Last": "last-step"}
+
 
 def run_name(algorithm: Mapping[str, Any]) -> str:
     """`erl-Hopper-v5` or `cerl-Swimmer-v5-delayed`, for the object tree of an algorithm."""
@@ -32,11 +34,11 @@ def _hybrid_word(algorithm: Mapping[str, Any], learners: int) -> str:
 def task_word(env: Mapping[str, Any]) -> str:
     """A task's id in Gymnasium or PettingZoo without its package, or the name of its class; with
     `-delayed` where its reward comes at the end of an episode, `-hidden` where a part of it is not
-    seen."""
+    seen, `-last-step` where the last action and reward are."""
     told = ""
     while "env" in env:  # a wrapper
-        known = [name for name in ("Delayed", "Hidden") if _class(env).startswith(name)]
-        told = "".join(f"-{name.lower()}" for name in known) + told
+        known = [word for name, word in WRAPPERS.items() if _class(env).startswith(name)]
+        told = "".join(f"-{word}" for word in known) + told
         env = env["env"]
     return str(env.get("id") or _class(env)).rpartition(":")[2] + told
 
