@@ -11,6 +11,7 @@ NAMES = (
     "sequence_generation",
     "team_generation",
     "td3_update",
+    "recurrent_update",
     "erl_hopper",
     "rover_step",
     "maddpg_update",

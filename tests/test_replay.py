@@ -389,6 +389,8 @@ def test_windows_stay_in_their_episode(lengths, burn_in):
             if counts[i, t, 0]:
                 seen.add((episode, first + t))
         assert counts[i].any() or (first > 0 and burn_in)
+        # A window has padding only if it holds all that there is of its episode.
+        assert counts[i, -1] or (episode, first - 1) not in held
     # All that can be told from a burn-in counts somewhere.
     late = {(e, t) for e, t in held if (e, 0) in held or (e, t - burn_in) in held}
     assert seen == late

@@ -130,9 +130,10 @@ class Replay(eqx.Module):
     def windows(
         self, n: int, sampling=UNIFORM, gamma: Any = 1.0, *, together=False, key
     ) -> Windowed:
-        """About `n` rows in windows of `sampling.burn_in + sampling.window`, each with a row drawn
-        as by `sample` among those that count. What stands behind the end of an episode is zeros and
-        does not count, nor does the burn-in of a window that begins within an episode.
+        """About `n` rows in windows of `sampling.burn_in + sampling.window`, each around a row
+        drawn as by `sample` and within its episode, as far as that is long enough: what stands
+        behind its end is zeros and does not count, nor does the burn-in of a window that begins
+        within it.
 
         **Returns:** the rows, `[windows · length, *agents, ...]`, `active` where they count; None,
         for each spans one step (`sample`); and the windows.
@@ -143,7 +144,10 @@ class Replay(eqx.Module):
         shape = (n, *(() if together else team))
         row = sampling.draw(self, shape, key=row_key)
         place = jax.random.randint(place_key, shape, sampling.burn_in, length)
-        first = (row - jnp.minimum(place, self._before(row, length - 1))) % self.capacity
+        # Near its end a window is moved back, so that an episode no longer than it is seen whole.
+        before, behind = self._before(row, length - 1), self._behind(row, length - 1)
+        place = jnp.minimum(jnp.maximum(place, length - 1 - behind), before)
+        first = (row - place) % self.capacity
         first = jnp.broadcast_to(first.reshape(n, -1), (n, *(team or (1,))))
         # Of the first row ever nothing was overwritten, so an episode begins there.
         whole = self.written <= self.capacity

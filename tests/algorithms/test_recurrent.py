@@ -166,9 +166,19 @@ def test_nothing_compiles_after_the_first_learning_generation():
 def test_what_memory_cannot_have_is_refused():
     with pytest.raises(ValueError, match="steps is 3 and Recurrent has memory"):
         OffPolicy(TASK, GRU, LEARNERS["td3"], sampling=Sampling(steps=3))
+    with pytest.raises(
+        ValueError, match=r"batch_size is 128 and .* windows of 200 frames behind 16"
+    ):
+        OffPolicy(TASK, GRU, LEARNERS["td3"], sampling=Sampling(window=200))
+    with pytest.raises(ValueError, match=r"room for 60 frames.* windows of 64 frames"):
+        OffPolicy(TASK, GRU, LEARNERS["td3"], replay_capacity=60)
+    with pytest.raises(
+        ValueError, match="batch_size is 16 and window is 20: a network with memory"
+    ):
+        PPO(TASK, GRU, batch_size=16, window=20)
     with pytest.raises(ValueError, match="a horizon asks the critic about the last step alone"):
         ERL(TASK, GRU, (LEARNERS["td3"],), horizon=Truncated(2))
-    with pytest.raises(TypeError, match="HistoryCritic is for an actor with memory"):
+    with pytest.raises(TypeError, match="HistoryCritic values windows of an episode"):
         run(OffPolicy(TASK, MLP(), LEARNERS["td3"], **SETTINGS), 20)
 
 

@@ -925,9 +925,22 @@ def test_networks_with_memory_are_trained_go_on_and_are_exported(credo, tmp_path
     assert credo(f"export {path} {tmp_path / 'policy.npz'}")[0] == 0
 
 
+def test_the_last_reward_is_told_as_it_is_paid(credo, tmp_path):
+    path = tmp_path / "run"
+    how = "--frames 200 --test-episodes 1 --network.hidden 4 --replay-capacity 1000"
+    code, _, err = credo(
+        f"train td3 Pendulum-v1 --delayed --last-step --hide 2 {how} --path {path}"
+    )
+    assert code == 0, err
+    env = Run(path).algorithm.env
+    kinds = [type(env).__name__, type(env.env).__name__, type(env.env.env).__name__]
+    assert kinds == ["LastHostStep", "DelayedHostReward", "HiddenHostEntries"]
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
+        ("td3 Pendulum-v1 --hide velocities --kwargs g=9", "not known which observations of Pend"),
         ("td3 Pendulum-v1 --hide 7", r"hides entries \(7,\): there are 0 … 2"),
         ("td3 Pendulum-v1 --hide 0,1,2", "hides all 3 entries"),
         ("td3 Pendulum-v1 --hide x", "hide is 'x': give numbers of entries"),

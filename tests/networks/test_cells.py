@@ -239,3 +239,21 @@ def test_mlp_follows_the_equations(depth, activation):
     actions, carries = read(MLPPolicy(on_device(w), net), jnp.asarray(inputs, jnp.float32))
     np.testing.assert_allclose(actions, expected, atol=1e-5)
     assert jax.tree.leaves(carries) == []
+
+
+def test_chrono_gates_keep_a_state_up_to_the_span():
+    """Times are uniform: the gate that keeps, σ(b), is 1 - 1 / time."""
+    for cell, name in (("gru", "b_z"), ("lstm", "b_f")):
+        weights = Recurrent(cell, 500, span=100).init(2, 1, key=jax.random.key(0)).weights
+        times = 1.0 + np.exp(np.asarray(weights[name]))
+        assert times.min() >= 2.0
+        assert times.max() <= 100.0
+        assert abs(times.mean() - 51.0) < 4.0
+        if cell == "lstm":
+            np.testing.assert_array_equal(weights["b_i"], -weights["b_f"])
+        drawn = Recurrent(cell, 500).init(2, 1, key=jax.random.key(0)).weights
+        np.testing.assert_array_equal(weights["U_" + name[2:]], drawn["U_" + name[2:]])
+    with pytest.raises(ValueError, match="span is 2: it must be at least 3"):
+        Recurrent("gru", span=2)
+    with pytest.raises(ValueError, match="an rnn has no gates, give span=0"):
+        Recurrent("rnn", span=10)

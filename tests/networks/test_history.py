@@ -158,7 +158,7 @@ def test_a_critic_remembers_what_was_seen_and_done(critic):
 
 def test_a_critic_needs_windows_and_a_network_with_memory():
     frames = Batch(jnp.zeros((4, OBS)), jnp.zeros((4, ACT)), *[None] * 4)
-    with pytest.raises(TypeError, match=r"HistoryCritic is for an actor with memory"):
+    with pytest.raises(TypeError, match="HistoryCritic values windows of an episode"):
         HistoryCritic().init(OBS, ACT, key=jax.random.key(0)).sees(frames)
     with pytest.raises(ValueError, match="memory is MLP: give a network with memory"):
         HistoryCritic(memory=MLP())

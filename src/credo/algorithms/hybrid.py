@@ -99,7 +99,7 @@ class Hybrid(eqx.Module):
             require.at_least(name, getattr(self, name), 0)
         require.fits(self.env, self.network, *self.learners)
         if self.learners:
-            require_windows(self.network, self.sampling)
+            require_windows(self.network, self.sampling, self.replay_capacity, *self.learners)
         for reward in (self.fitness, *(learner.signal for learner in self.learners)):
             objective(self.env, reward)
         q = len(self.learners)

@@ -69,7 +69,7 @@ class OffPolicy(eqx.Module):
         for name in ("episodes", "test_episodes", "test_every", "replay_capacity"):
             require.at_least(name, getattr(self, name), 1)
         require.fits(self.env, self.network, self.learner)
-        require_windows(self.network, self.sampling)
+        require_windows(self.network, self.sampling, self.replay_capacity, self.learner)
         require.at_least("start_frames", self.start_frames, 0)
         require.at_least("updates_per_frame", self.updates_per_frame, 0)
         objective(self.env, self.learner.signal)

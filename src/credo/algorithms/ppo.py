@@ -115,6 +115,11 @@ class PPO(eqx.Module):
         counts = ("horizon", "copies", "epochs", "batch_size", "window")
         for name in (*counts, "test_episodes", "test_every"):
             require.at_least(name, getattr(self, name), 1)
+        if self.batch_size < self.window and self.network.remembers:
+            raise ValueError(
+                f"batch_size is {self.batch_size} and window is {self.window}: a network with "
+                "memory learns from whole windows; give a larger batch_size, or a smaller window"
+            )
         for name in ("gamma", "gae"):
             require.within(name, getattr(self, name), 0, 1)
         for name in ("clip", "learning_rate", "value_weight", "max_norm", "first_std"):
@@ -298,7 +303,10 @@ def surrogate(ppo: PPO, networks: Networks, rows: Sample) -> tuple[Float[Array, 
         means, value = act(actor.mean, rows.obs), _value(critic, rows.obs)
     else:
         means, value = _told_in_windows(ppo, networks, rows)
-    ratio = jnp.exp(actor.log_density(means, rows.action) - rows.log_density)
+    change = actor.log_density(means, rows.action) - rows.log_density
+    if rows.counts is not None:  # what is no frame must not overflow
+        change = jnp.where(rows.counts, change, 0.0)
+    ratio = jnp.exp(change)
     bounded = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
     gain = jnp.minimum(ratio * rows.advantage, bounded * rows.advantage)
     policy_loss = -mean(gain, rows.counts)

@@ -131,14 +131,14 @@ def algorithm_of(line: Line, command: Train) -> Any:
         from ..environments.hidden import hidden
 
         env = hidden(env, command.hide)
-    if command.last_step:
-        from ..environments.last_step import with_last_step
-
-        env = with_last_step(env)
     if command.delayed:
         from ..environments import wrappers
 
         env = wrappers.delayed(env)
+    if command.last_step:  # around all else: it tells what was paid, and no more
+        from ..environments.last_step import with_last_step
+
+        env = with_last_step(env)
     return line.take(build(env, network))
 
 

@@ -48,11 +48,13 @@ def hidden(env: AbstractEnvironment | AbstractHostEnvironment, entries: str | tu
 
 def _velocities(env: AbstractTask) -> tuple[int, ...]:
     name = str(getattr(env.unwrapped, "id", type(env.unwrapped).__name__))
-    short = name.rpartition(":")[2].rpartition("/")[2].partition("-v")[0]
-    if short not in VELOCITIES:
+    short = name.partition("-v")[0]
+    # A task that is made with settings of its own may tell more, or less.
+    if short not in VELOCITIES or getattr(env.unwrapped, "kwargs", ()):
         raise ValueError(
             f"it is not known which observations of {name} are velocities: give their numbers, "
-            f"counted from 0, as in 2,3; known are {', '.join(sorted(VELOCITIES))}"
+            f"counted from 0, as in 2,3; known are {', '.join(sorted(VELOCITIES))}, without "
+            "settings of their own"
         )
     return VELOCITIES[short]
 
@@ -116,7 +118,7 @@ class HiddenHostEntries(Hiding, AbstractHostWrapper):
     entries: tuple[int, ...] = eqx.field(static=True)  # counted from 0, in order
 
     def task_record(self) -> dict[str, Any]:
-        return self.env.task_record() | {"obs_size": self.obs_size}
+        return self.env.task_record() | {"obs_size": self.obs_size, "observations": None}
 
     def around(self, inner: AbstractCopies) -> "HiddenCopies":
         return HiddenCopies(inner, self.kept)

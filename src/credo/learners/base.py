@@ -219,8 +219,15 @@ def act(policy: AbstractPolicy, obs: Float[Array, "batch *agents obs"]) -> Array
     return jax.vmap(lambda x: policy(x, start)[0])(obs)
 
 
-def require_windows(network: AbstractNetwork, sampling: Sampling) -> None:
+def require_windows(network: AbstractNetwork, sampling: Sampling, capacity: int, *learners) -> None:
     """Raise if minibatches for a network with memory are asked for that there are not."""
+    length, least = sampling.window + sampling.burn_in, min(x.batch_size for x in learners)
+    if (least < sampling.window or length > capacity) and network.remembers:
+        raise ValueError(
+            f"batch_size is {least} and the replay buffer has room for {capacity:,} frames, and "
+            f"{type(network).__name__} has memory, which learns from windows of {sampling.window} "
+            f"frames behind {sampling.burn_in} others: give more, or a smaller sampling.window"
+        )
     if sampling.steps > 1 and network.remembers:
         raise ValueError(
             f"steps is {sampling.steps} and {type(network).__name__} has memory, which learns from "

@@ -13,6 +13,7 @@ plays with it, so nothing could be stored.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -157,23 +158,21 @@ class HistoryCriticNetwork(AbstractCriticNetwork):
     action_size: int = eqx.field(static=True)
 
     def sees(self, batch, later=False):
-        if batch.windows is None:
-            raise TypeError("HistoryCritic is for an actor with memory, --network gru: give Critic")
+        windows = batch.windows
+        if windows is None:
+            raise TypeError(
+                "HistoryCritic values windows of an episode, which networks with memory learn "
+                "from: give such a network (--network gru), or a critic without memory, Critic()"
+            )
         seen, done = moments(batch, later), by_window(batch, batch.action)
         done = jnp.concatenate([jnp.zeros_like(done[:, :1]), done], axis=1)[:, : seen.shape[1]]
         inputs = jnp.concatenate([seen, done], axis=-1)
-        team = inputs.shape[2:-1]
-        alone = (
-            jnp.moveaxis(inputs, 2, 1).reshape(-1, *inputs.shape[1:2], inputs.shape[-1])
-            if team
-            else inputs
-        )
-        about = Windows(
-            batch.windows.fresh.reshape(-1), batch.windows.memory, *_sizes(batch.windows)
-        )
-        told = unrolled(self.memory, alone, about, stored=False)
-        if team:
-            told = jnp.moveaxis(told.reshape(len(seen), *team, *told.shape[1:]), 1, 2)
+
+        def remember(inputs, fresh):
+            return unrolled(self.memory, inputs, replace(windows, fresh=fresh), stored=False)
+
+        each = jax.vmap(remember, (2, 1), 2) if inputs.ndim > 3 else remember
+        told = each(inputs, windows.fresh)
         known = jnp.concatenate([told, seen], axis=-1)
         return features_first(by_row(known, later))
 
@@ -182,10 +181,6 @@ class HistoryCriticNetwork(AbstractCriticNetwork):
 
     def own(self, obs, action, done):
         return self.critic.own(obs, action, done)
-
-
-def _sizes(windows: Windows) -> tuple[int, int]:
-    return windows.length, windows.burn_in
 
 
 def remembering(critic: AbstractCritic) -> AbstractCritic:

@@ -104,7 +104,7 @@ class TeamPolicy(AbstractPolicy):
     def remembered(self, carry):
         if self.apart:
             each = [head.remembered(own) for head, own in zip(self.heads, carry, strict=True)]
-            return None if None in each else jnp.stack(each)  # pyright: ignore
+            return None if each[0] is None else jnp.stack(each)  # pyright: ignore[reportArgumentType]
         return self._each(lambda _, head, own: head.remembered(own), carry)
 
     def recalled(self, memory, *, key):

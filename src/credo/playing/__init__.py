@@ -68,7 +68,9 @@ class _Group:
             lambda arrays: eqx.filter_vmap(lambda one: one.first())(self._form.filled(arrays)),
             self._arrays,
         )
-        return first and np.zeros((part.worlds.size, *first.shape[1:]), first.dtype)
+        if first is None:
+            return None
+        return np.zeros((part.worlds.size, *first.shape[1:]), first.dtype)
 
     def begin(self) -> None:
         """The memories with which a turn begins."""
