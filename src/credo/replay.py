@@ -170,7 +170,8 @@ class Replay(eqx.Module):
         return jnp.where(self.written > self.capacity, self.position, 0)
 
     def _over(self, row: Int[Array, "*any"]) -> Bool[Array, "*any"]:
-        """Whether an episode ends with this row, for all agents."""
+        """Whether an episode ends with this row, for all agents. Rows do not say whether a world
+        goes on that all of them left at once: that counts as its end."""
         row = row % self.capacity
         ended = self.data.terminated[row]
         return ended.reshape(*row.shape, -1).all(axis=-1) | self.data.truncated[row]
