@@ -152,6 +152,18 @@ def test_teams_with_memory_are_evolved_and_learn(network):
     assert max(row["champion_score"] for row in rows) == 1.0
 
 
+@pytest.mark.parametrize("sharing", ["trunk", "nothing"])
+def test_a_team_with_memory_learns_without_evolution(sharing):
+    """From windows of which some begin within an episode."""
+    learner = TD3(signal="local", **FAST | {"critic": Critic(hidden=(16,)), "batch_size": 64})
+    learner = dataclasses.replace(learner, noise=GaussianNoise(0.5), reward_scale=5.0)
+    network = Team(trunk=(8,), head=GRU, sharing=sharing)
+    how = SETTINGS | {"sampling": Sampling(window=2, burn_in=1), "updates_per_frame": 0.5}
+    rows, _ = run(OffPolicy(Meet(), network, learner, **how), 60)
+    assert max(row["champion_score"] for row in rows) == 1.0
+    assert rows[0]["champion_score"] < 1.0
+
+
 def test_nothing_compiles_after_the_first_learning_generation():
     alone = OffPolicy(HostWalk(spread=0.5), GRU, LEARNERS["td3"], **SETTINGS)
     state = alone.init(key=jax.random.key(0))
