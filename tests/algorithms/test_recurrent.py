@@ -207,4 +207,6 @@ def test_presets_have_windows_in_their_batches(preset):
     assert ERL.hybrid(TASK, MLP()).horizon is not None
     assert ERL.cerl(TASK, GRU).learners[3].batch_size == 1024
     assert ERL.ea(TASK, GRU).updates_per_frame == 1.0
+    assert PPO.ppo(TASK, GRU).batch_size == 512
+    assert PPO.ppo(TASK, MLP()).batch_size == 64
     assert MERL.hybrid(Meet(), Team(head=GRU)).learners[0].batch_size == 1024

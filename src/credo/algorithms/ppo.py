@@ -128,8 +128,11 @@ class PPO(eqx.Module):
 
     @classmethod
     def ppo(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """The constants of its authors for MuJoCo, and what the paper leaves open."""
+        """The constants of its authors for MuJoCo, and what the paper leaves open. For a network
+        with memory minibatches hold 512 frames, which are 8 windows of 64."""
         given: dict[str, Any] = {} if network is None else {"network": network}
+        if network is not None and network.remembers:
+            given["batch_size"] = 512
         return cls(env, **given | overrides)
 
     @classmethod

@@ -58,13 +58,13 @@ def unrolled(
         told, carry = jax.vmap(call)(obs, carry)
         return carry, told
 
-    moments, n = jnp.moveaxis(seen, 1, 0), windows.burn_in
-    carry, early = jax.lax.scan(advance, carry, moments[:n])
+    moments, n, told = jnp.moveaxis(seen, 1, 0), windows.burn_in, []
     if n:
+        carry, early = jax.lax.scan(advance, carry, moments[:n])
         carry = jax.vmap(lambda own, fresh: _cut(policy, own, fresh, key))(carry, windows.fresh)
-    _, late = jax.lax.scan(advance, carry, moments[n:])
-    together = jax.tree.map(lambda *xs: jnp.concatenate(xs), early, late)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), together)
+        told = [early]
+    told.append(jax.lax.scan(advance, carry, moments[n:])[1])
+    return jax.tree.map(lambda *xs: jnp.moveaxis(jnp.concatenate(xs), 0, 1), *told)
 
 
 def _cut(policy: AbstractPolicy, carry: PyTree, fresh: Bool[Array, "*agents"], key) -> PyTree:
