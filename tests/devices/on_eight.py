@@ -155,12 +155,15 @@ def resumed(folder: pathlib.Path):
     return hashes(credo.resume(folder / "on", generations=6, devices=8, **QUIET))
 
 
+LONG = 2_000  # generations, of which a signal comes in the first: nobody is done by then
+
+
 def seeds(folder: pathlib.Path):
     """Three seeds on two devices, and one of a task that cannot be, stopped by a signal and gone on
     with; and what became of them, with a run of each alone."""
     made, broken = ALGORITHMS["sequences"], config.to_tree(ALGORITHMS["sequences"])
     broken["env"] = broken["env"] | {"depth": 0}
-    options = credo.RunOptions(generations=300, devices=2, tensorboard=False)
+    options = credo.RunOptions(generations=LONG, devices=2, tensorboard=False)
     jobs = [Job(folder / f"seed-{n}", made, n, options) for n in range(3)]
     jobs.insert(1, Job(folder / "broken", broken, 0, options))
     codes = []
@@ -181,7 +184,7 @@ def seeds(folder: pathlib.Path):
     except executors.RunsFailed as error:
         codes.append(str(error).replace(str(folder), ""))
     alone = [
-        credo.train(made, generations=300, seed=n, path=folder / f"alone-{n}", **QUIET)
+        credo.train(made, generations=LONG, seed=n, path=folder / f"alone-{n}", **QUIET)
         for n in (0, 2)
     ]
     together = [credo.Run(folder / f"seed-{n}") for n in (0, 2)]

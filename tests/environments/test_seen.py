@@ -92,8 +92,9 @@ def test_views_are_put_on_top_of_each_other():
 
 
 @pytest.mark.parametrize("short", VELOCITIES)
-def test_what_is_known_as_a_velocity_is_one(short):
+def test_what_is_known_as_a_velocity_is_one(short, tmp_path, monkeypatch):
     """Positions are told the same from the same state at another speed."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file where it is
     import gymnasium
 
     versions = {"Pendulum": "v1", "MountainCarContinuous": "v0"}
