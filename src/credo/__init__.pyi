@@ -14,7 +14,9 @@ from .environments.base import AbstractEnvironment as AbstractEnvironment
 from .environments.base import AbstractSequenceTask as AbstractSequenceTask
 from .environments.checks import check_environment as check_environment
 from .environments.curriculum import Curriculum as Curriculum
+from .environments.distracted_cue import DistractedCue as DistractedCue
 from .environments.double_pole import DoublePole as DoublePole
+from .environments.endless_tmaze import EndlessTMaze as EndlessTMaze
 from .environments.extended_tmaze import ExtendedTMaze as ExtendedTMaze
 from .environments.gymnasium import Gymnasium as Gymnasium
 from .environments.host import AbstractHostEnvironment as AbstractHostEnvironment

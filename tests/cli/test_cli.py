@@ -140,7 +140,7 @@ def test_list_names_everything(credo):
         ("train td3 Pendulum-v1 --network lstmm", "no network 'lstmm'", "did you mean 'lstm'?"),
         ("train erl Pendulum-v1 --preset as-coded", "no preset 'as-coded' of erl", "one of: ours"),
         ("train cerl Pendulum-v1 --manager thomson", "no manager 'thomson'", "'thompson'?"),
-        ("train erl Pendulum-v1 --gamma big", "--learners.0.gamma is 'big'", "it must be float"),
+        ("train erl Pendulum-v1 --gamma big", "--learners.0.gamma is 'big'", "it must be a number"),
         ("train td3 Pendulum-v1 --config nowhere.toml", "--config nowhere.toml", "No such file"),
         ("train td3 Hoper-v5", "no task 'Hoper-v5'", "did you mean 'Hopper-v5'?"),
         ("train td3 Pendulum-v1 --preset td4", "td3 has no presets", ""),
@@ -1157,3 +1157,21 @@ def test_a_hybrid_whose_learners_never_joined_says_so(credo, tmp_path):
         words = f"train erl Pendulum-v1 --generations {generations} --sync-period 2 {short}"
         code, _, err = credo(f"{words} --path {tmp_path / str(generations)}")
         assert (code, told in err) == (0, said), err
+
+
+def test_evaluate_says_how_far_memory_reaches(credo, run):
+    code, out, _ = credo(f"evaluate {run} --episodes 10 --horizon 1,3")
+    assert code == 0
+    first, once, thrice = out.splitlines()
+    assert first.endswith("success in 10 fresh episodes of each")
+    assert re.match(r"  × 1 +[\d.]+ ± [\d.]+ +depth 2$", once)
+    assert re.match(r"  × 3 +[\d.]+( ± [\d.]+)? +depth 6$", thrice)
+    assert "horizon is 0: it must be at least 1" in credo(f"evaluate {run} --horizon 0")[2]
+
+
+def test_a_task_without_a_horizon_says_so(credo, tmp_path):
+    path = tmp_path / "poles"
+    credo(f"train neuroevolution double-pole --network mmu --generations 1 --path {path}")
+    code, _, err = credo(f"evaluate {path} --horizon")
+    assert code == 2
+    assert "DoublePole has no setting that says for how long" in err

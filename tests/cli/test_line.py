@@ -135,9 +135,9 @@ def test_a_field_of_the_task_that_the_algorithm_has_too_needs_its_full_name():
         ("--manager tompson", "did you mean 'thompson'?"),
         ("--manager os:system", "os:system is no AbstractManager"),
         ("--manager credo.learners.td3:TD3", "credo.learners.td3:TD3 is no AbstractManager"),
-        ("--size three", "--size is 'three': it must be int"),
+        ("--size three", "--size is 'three': it must be a whole number"),
         ("--size", "--size needs a value"),
-        ("--learners.0.gamma x", "--learners.0.gamma is 'x': it must be float"),
+        ("--learners.0.gamma x", "--learners.0.gamma is 'x': it must be a number"),
     ],
 )
 def test_wrong_values_are_named_with_what_is_right(words, told, capsys):

@@ -10,7 +10,9 @@ import pytest
 
 from credo import compilation, tree
 from credo.environments.base import AbstractEnvironment
+from credo.environments.distracted_cue import DistractedCue
 from credo.environments.double_pole import DoublePole
+from credo.environments.endless_tmaze import EndlessTMaze
 from credo.environments.passive_tmaze import PassiveTMaze
 from credo.environments.probes import Copy, Locked, Meet, Remember, Xor
 from credo.environments.sequence_classification import SequenceClassification
@@ -52,6 +54,8 @@ ENVIRONMENTS = {
     "remember": Remember(delay=1),
     "xor": Xor(),
     "passive tmaze": PassiveTMaze(2),
+    "endless tmaze": EndlessTMaze(2, 1, 2),
+    "distracted cue": DistractedCue(0, 2),
     "double pole": DoublePole(max_steps=3, spread=1.0),
     "meet": Meet(),
     "delayed": delayed(Meet()),

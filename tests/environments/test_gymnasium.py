@@ -18,6 +18,8 @@ TASKS = {
     "credo/SequenceClassification-v0": {"depth": 3, "min_gap": 1, "max_gap": 3},
     "credo/SequenceRecall-v0": {"depth": 2, "min_corridor": 1, "max_corridor": 3},
     "credo/SequenceCopy-v0": {"bits": 2, "max_length": 3},
+    "credo/EndlessTMaze-v0": {"corridors": 2, "min_length": 1, "max_length": 2},
+    "credo/DistractedCue-v0": {"min_distractors": 1, "max_distractors": 2},
     "credo/DoublePole-v0": {"max_steps": 5, "spread": 1.0},
 }
 
@@ -89,7 +91,7 @@ def test_the_reward_is_the_signal_asked_for(signal):
 
 
 def test_the_first_signal_is_the_default(env):
-    assert env.unwrapped.signal == "fitness"
+    assert env.unwrapped.signal == env.unwrapped.env.signals[0]
 
 
 def test_an_unknown_signal_is_refused():

@@ -151,6 +151,22 @@ def test_an_mmu_may_start_open_to_its_inputs():
         np.testing.assert_allclose(leaf, expected, rtol=1e-6, err_msg=name)
 
 
+def test_a_latched_mmu_keeps_its_memory_until_an_input_opens_the_gate():
+    """A sign is written by about half of the cells; then nothing moves in 10,000 steps of zeros."""
+    network = MMU(32, start_weights="latched", initializer="fan_in", output_activation="tanh")
+    policy = network.init(2, 2, key=jax.random.key(0))
+    carry = policy.start(key=jax.random.key(0))
+    _, written = policy(jnp.array([1.0, 0.0]), carry)
+    moved = np.abs(written[1] - carry[1])
+    assert 4 < (moved > 0.01).sum() < 28
+
+    def wait(carry, _):
+        return policy(jnp.zeros(2), carry)[1], None
+
+    kept, _ = jax.lax.scan(wait, written, None, 10_000)
+    np.testing.assert_allclose(kept[1], written[1], atol=5e-3)
+
+
 def test_mmu_has_one_leaf_per_matrix_of_the_equations():
     net = MMU(hidden=4, memory=2, **BOTH_LEARNED)
     policy = net.init(3, 2, key=jax.random.key(0))

@@ -8,6 +8,8 @@ import pytest
 
 from credo.algorithms.neat import NEAT
 from credo.algorithms.neuroevolution import Neuroevolution
+from credo.analysis import probes
+from credo.environments.passive_tmaze import PassiveTMaze
 from credo.environments.probes import Remember
 from credo.environments.sequence_copy import SequenceCopy
 from credo.networks.dnc import DNC
@@ -16,7 +18,7 @@ from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.networks.ntm import NTM
 from credo.report import champions, run_page
-from credo.report.sections import Drawing, HeatMap, Table
+from credo.report.sections import Drawing, Figure, HeatMap, Table
 from credo.runs.loop import train
 from credo.runs.store import Run
 
@@ -109,10 +111,9 @@ def test_a_run_of_neat_shows_its_graph_on_the_page(tmp_path):
 )
 def test_heads_are_shown_row_by_row(network, titles, tmp_path):
     run = evolved(network, tmp_path)
-    maps = list(champions.pictures(run))
+    maps = [x for x in champions.pictures(run) if isinstance(x, HeatMap)]
     assert len(maps) == len(titles)
     for shown, title in zip(maps, titles, strict=True):
-        assert isinstance(shown, HeatMap)
         assert title in shown.title
         assert shown.row_labels == ["1", "2", "3", "4"][: len(shown.row_labels)]
         assert len(shown.column_labels) == np.shape(shown.values)[1] >= 3
@@ -121,7 +122,8 @@ def test_heads_are_shown_row_by_row(network, titles, tmp_path):
 
 
 def test_memory_cells_are_shown(tmp_path):
-    (shown,) = champions.pictures(evolved(MMU(hidden=3), tmp_path))
+    found = champions.pictures(evolved(MMU(hidden=3), tmp_path))
+    (shown,) = (x for x in found if isinstance(x, HeatMap))
     assert np.shape(shown.values)[0] == 3
     assert shown.y_label == "memory cell"
 
@@ -140,3 +142,40 @@ def test_of_sequences_a_long_one_is_shown_and_empty_rows_are_not(tmp_path):
     assert shown.row_labels == ["1", "2"]
     assert "Nothing reaches 0.01 in the 3 rows" in shown.caption
     assert list(champions._map("Where it is", values * np.nan, "row")) == []
+
+
+class TestProbes:
+    """Beside what a network keeps, how long it keeps it, and where."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def shown(cls, tmp_path_factory):
+        run = evolved(MMU(hidden=3), tmp_path_factory.mktemp("probes"), PassiveTMaze(3))
+        return list(champions.pictures(run))
+
+    def test_the_horizon_curve_has_four_lengths(self, shown):
+        (curve,) = (x for x in shown if isinstance(x, Figure))
+        assert np.asarray(curve.curves[0].x).tolist() == [1, 2, 5, 10]
+        assert np.shape(curve.curves[0].runs) == (1, 4)
+        assert "× 10: length 30" in curve.caption
+        assert curve.y_label == "success"
+
+    def test_every_cell_has_a_row(self, shown):
+        (table,) = (x for x in shown if isinstance(x, Table))
+        assert sorted(row[0] for row in table.rows) == ["1", "2", "3"]
+        assert all(0 <= x <= 1 for row in table.rows for x in row[1:])
+        assert table.columns == ["cell", "success without it", "success with it alone"]
+
+    def test_the_most_needed_of_many_cells_come_first(self, monkeypatch):
+        without = np.ones(20)
+        without[[4, 9]] = 0.25, 0.5
+        worth = probes.Worth(1.0, without, np.zeros(20), 0.0)
+        monkeypatch.setattr(champions, "worth_of_cells", lambda *_, **__: worth)
+        (table,) = champions.cells(PassiveTMaze(3), None)
+        assert [row[0] for row in table.rows[:2]] == ["5", "10"]
+        assert len(table.rows) == champions.ROWS
+        assert f"The {champions.ROWS} most needed of 20 cells" in table.caption
+
+    def test_no_curve_where_the_task_has_no_setting_for_it(self, tmp_path):
+        run = evolved(MMU(hidden=2), tmp_path, Remember(delay=1))
+        assert not [x for x in champions.pictures(run) if isinstance(x, Figure)]

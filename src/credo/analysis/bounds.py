@@ -8,13 +8,15 @@ Sequence Classification where ties are free. Both are in units of the reward tha
 |---|---|---|
 | Sequence Classification, Sequence Recall | `sequences` | counting, exact |
 | Extended T-Maze | `tmaze` | counting, exact |
-| passive T-maze | `corridor` | exact |
+| passive and endless T-maze, Distracted Cue | `corridor` | exact |
 | server fleet | `fleet` | 1,000 episodes of scripted fleets and of an oracle |
 | rovers | `planner` | scripted teams in 50 worlds, and a bound that is proven for each |
 """
 
 from types import ModuleType
 
+from ..environments.distracted_cue import DistractedCue
+from ..environments.endless_tmaze import EndlessTMaze
 from ..environments.extended_tmaze import ExtendedTMaze
 from ..environments.passive_tmaze import PassiveTMaze
 from ..environments.rover import Rover
@@ -29,6 +31,8 @@ EXACT: dict[type, ModuleType] = {
     SequenceRecall: sequences,
     ExtendedTMaze: tmaze,
     PassiveTMaze: corridor,
+    EndlessTMaze: corridor,
+    DistractedCue: corridor,
 }
 """Tasks whose numbers are counted, in seconds at most; those of the others are played."""
 

@@ -85,6 +85,13 @@ def lay_out(
     return jax.vmap(lambda row: fixed.lay_out(row, gaps))(jnp.asarray(signals, jnp.float32))
 
 
+def with_memory(carry: Any, memory: Float[Array, "*agents cells"]) -> Any:
+    """A carry with another memory, of a carry in which `known_memory` is known."""
+    if isinstance(carry, DMMUCarry):
+        return dataclasses.replace(carry, memory=memory)
+    return (carry[0], memory) if isinstance(carry, tuple) else memory
+
+
 class FinalStates(eqx.Module):
     """Table 3.1: one row per signal sequence."""
 
@@ -114,7 +121,8 @@ def final_states(
 
 
 class Masked(AbstractPolicy):
-    """A policy some of whose cells are held at a fixed value, before every step."""
+    """A policy some of whose cells are held at a fixed value, before every step; of a team with
+    private memories the same of every agent."""
 
     policy: AbstractPolicy
     keep: Bool[Array, " cells"]  # cells left alone
@@ -128,8 +136,7 @@ class Masked(AbstractPolicy):
         return action, self._mask(carry)
 
     def _mask(self, carry):
-        memory = jnp.where(self.keep, memory_of(carry), self.held)
-        return (carry[0], memory) if isinstance(carry, tuple) else memory
+        return with_memory(carry, jnp.where(self.keep, memory_of(carry), self.held))
 
 
 class Relevance(eqx.Module):

@@ -55,6 +55,9 @@ class Evaluate(PolicyOf):
     """Episodes to play, at least 1. None: 1000, and 20 of a task outside JAX."""
     seed: int = 0
     """Seed of the episodes, 0 to 2^32 - 1. They are others than those of training."""
+    horizon: tuple[int, ...] | None = None
+    """Score where something has to be remembered this many times as long, such as 1,10,1000; with
+    no number behind it 1,2,5,10,100. Of tasks that say what that is: T-mazes, sequence tasks."""
     kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
     """NAME=VALUE …: what a task of Gymnasium or PettingZoo is made with, such as g=9.8. Values are
     read as Python: 8, 0.5, False, None, (1, 2); anything else is a string."""
@@ -62,6 +65,8 @@ class Evaluate(PolicyOf):
     def __post_init__(self):
         require.at_least("episodes", self.episodes, 1)
         require_seeds(self.seed)
+        for times in self.horizon or ():
+            require.at_least("horizon", times, 1)
 
     def __call__(self, line: Line) -> None:
         """Play, run by run, and print the mean of each metric, of several runs also over runs."""
@@ -73,6 +78,10 @@ class Evaluate(PolicyOf):
             run = Run(path, trust=self.trust, best=self.best)
             task = self._task(line, run.algorithm.env)
             line.done()
+            if self.horizon is not None:
+                for told in evaluation.horizon(run, task, self.horizon, self.episodes, self.seed):
+                    print(told, flush=True)
+                continue
             lines, result = evaluation.describe(run, task, self.episodes, self.seed)
             print(*lines, sep="\n")
             results += [] if result is None else [result]

@@ -63,7 +63,24 @@ def _by_type(name: str, kind: Any, words: list[str]) -> Any:
         if len(words) == 1 and typing.get_origin(kind) is Literal:
             fail(f"no {name} {words[0]!r}", words[0], typing.get_args(kind))
         told = f"is {' '.join(words)!r}" if words else "needs a value"
-        fail(f"--{name} {told}: it must be {inspect.formatannotation(kind)}")
+        fail(f"--{name} {told}: it must be {in_words(kind)}")
+
+
+NOUNS = {int: "a whole number", float: "a number", bool: "True or False", types.NoneType: "None"}
+
+
+def in_words(kind: Any) -> str:
+    """A type, for people: `whole numbers, as in 1,2,3`."""
+    origin, inside = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (types.UnionType, typing.Union):
+        return ", or ".join(in_words(part) for part in inside)
+    if origin is tuple:
+        each = {in_words(part) for part in inside if part is not ...}
+        what = " or ".join(sorted(each)).replace("a whole number", "whole numbers")
+        what = re.sub(r"\ba number\b", "numbers", what)
+        length = "" if ... in inside else f" ({len(inside)} of them)"
+        return f"{what}{length} with commas between"
+    return NOUNS.get(kind) or inspect.formatannotation(kind)
 
 
 def plain(token: str) -> str:

@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -44,6 +44,11 @@ class AbstractTask(eqx.Module):
     def unwrapped(self) -> Any:
         """The task itself, within whatever delays its rewards, adds noise or cuts it short."""
         return self
+
+    def longer(self, times: int) -> Self | None:
+        """This task where something has to be remembered `times` as long, at least 1; None: it
+        has no setting for that."""
+        return None
 
     def viewer(self) -> Viewer | None:
         """How a page draws its episodes; None: it does not. A task that draws its state in

@@ -34,6 +34,8 @@ TASKS = {
     "credo/SequenceCopy-v0": "credo.environments.sequence_copy:SequenceCopy",
     "credo/RepeatCopy-v0": "credo.environments.sequence_copy:RepeatCopy",
     "credo/PassiveTMaze-v0": "credo.environments.passive_tmaze:PassiveTMaze",
+    "credo/EndlessTMaze-v0": "credo.environments.endless_tmaze:EndlessTMaze",
+    "credo/DistractedCue-v0": "credo.environments.distracted_cue:DistractedCue",
     "credo/DoublePole-v0": "credo.environments.double_pole:DoublePole",
 }
 

@@ -11,7 +11,8 @@ Departures:
 - There is no way back: a policy that does not walk stays where it is.
 """
 
-from typing import ClassVar
+import dataclasses
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -58,6 +59,9 @@ class PassiveTMaze(AbstractEnvironment):
     @property
     def max_steps(self) -> int:
         return self.length + 1
+
+    def longer(self, times: int) -> Self:
+        return dataclasses.replace(self, length=times * self.length)
 
     def reset(self, *, key: PRNGKeyArray) -> tuple[PassiveTMazeState, TimeStep]:
         side = jax.random.rademacher(key, (), jnp.float32)

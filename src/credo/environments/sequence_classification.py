@@ -15,7 +15,8 @@ Departures from the dissertation:
   after the last signal.
 """
 
-from typing import ClassVar, Literal
+import dataclasses
+from typing import ClassVar, Literal, Self
 
 import equinox as eqx
 import jax
@@ -62,6 +63,10 @@ class SequenceClassification(AbstractSequenceTask):
     @property
     def max_steps(self) -> int:
         return self.depth + (self.depth - 1) * self.max_gap
+
+    def longer(self, times: int) -> Self:
+        """More signals, with gaps as they are."""
+        return dataclasses.replace(self, depth=times * self.depth)
 
     def sample(self, *, key: PRNGKeyArray) -> Sequence:
         signal_key, gap_key = jax.random.split(key)

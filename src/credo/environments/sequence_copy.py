@@ -18,8 +18,9 @@ Departures from the paper:
 - While the end marker is asked for, all bits are asked to be 0, and before that the marker is.
 """
 
+import dataclasses
 import math
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -66,6 +67,11 @@ class SequenceCopy(AbstractSequenceTask):
     @property
     def max_steps(self) -> int:
         return 2 * self.max_length + 1
+
+    def longer(self, times: int) -> Self:
+        """More vectors in a sequence."""
+        low, high = times * self.min_length, times * self.max_length
+        return dataclasses.replace(self, min_length=low, max_length=high)
 
     def sample(self, *, key: PRNGKeyArray) -> Sequence:
         bit_key, length_key = jax.random.split(key)
@@ -129,6 +135,11 @@ class RepeatCopy(AbstractSequenceTask):
     @property
     def max_steps(self) -> int:
         return self.max_length * (1 + self.max_repeats) + 2
+
+    def longer(self, times: int) -> Self:
+        """More vectors in a sequence."""
+        low, high = times * self.min_length, times * self.max_length
+        return dataclasses.replace(self, min_length=low, max_length=high)
 
     def sample(self, *, key: PRNGKeyArray) -> Sequence:
         bit_key, length_key, repeat_key = jax.random.split(key, 3)

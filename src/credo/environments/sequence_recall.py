@@ -13,7 +13,8 @@ Departures from the dissertation:
 - One encoding for evolution and gradient; the author's gradient version used another.
 """
 
-from typing import ClassVar
+import dataclasses
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -60,6 +61,13 @@ class SequenceRecall(AbstractSequenceTask):
     @property
     def max_steps(self) -> int:
         return self.depth + self.depth * self.max_corridor
+
+    def longer(self, times: int) -> Self:
+        """Longer corridors. Distances keep their unit, or a longer corridor would look like a
+        shorter one."""
+        low, high = times * self.min_corridor, times * self.max_corridor
+        unit = self.unit or self.max_corridor
+        return dataclasses.replace(self, min_corridor=low, max_corridor=high, unit=unit)
 
     def sample(self, *, key: PRNGKeyArray) -> Sequence:
         direction_key, corridor_key = jax.random.split(key)

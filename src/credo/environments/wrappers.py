@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import threading
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -111,6 +111,10 @@ class AbstractWrapper(AbstractEnvironment):
 
     def bare(self, state: PyTree) -> PyTree:
         return self.env.bare(state)
+
+    def longer(self, times: int) -> Self | None:
+        inner = self.env.longer(times)
+        return None if inner is None else dataclasses.replace(self, env=inner)
 
     def viewer(self) -> Viewer | None:
         """That of the task itself."""

@@ -1,5 +1,5 @@
-"""A champion, drawn: the graph of a network of NEAT, and what a network with memory keeps there in
-one episode, or where the heads of an NTM or a DNC are.
+"""A champion, drawn: the graph of a network of NEAT; of a network with memory what it keeps in one
+episode, or where the heads of an NTM or a DNC are, how long that lasts, and which cells count.
 
 The episode is played on Credo's own tasks in JAX alone: no code that a record names is imported.
 """
@@ -13,7 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch
 
+from .. import tree
 from ..analysis.memory import known_memory, weightings
+from ..analysis.probes import reach, worth_of_cells
 from ..environments.base import AbstractEnvironment, AbstractSequenceTask
 from ..environments.wrappers import Given
 from ..networks.graph import GraphPolicy
@@ -22,13 +24,16 @@ from ..rollout import record
 from ..runs import policy as policies
 from ..runs.store import Run
 from .figures import drawing
-from .sections import Drawing, HeatMap, Section, Table
+from .sections import Cell, Curve, Drawing, Figure, HeatMap, Section, Table
 from .styles import Theme
 
 MOST = 10_000  # steps of an episode that is played for it
 LONGEST = 120  # moments of an episode that a heat map shows
 FAINT = 0.01  # rows behind the last that reaches this are left out
+PLAYED = 50  # episodes of a probe
+ROWS = 16  # cells in a table
 DRAWN = 16  # sequences, of which one is shown
+SEED = 1_000_003  # of the episodes of probes
 PORTS = ("block input", "input gate", "forget gate", "output gate")
 DASHES: tuple[Any, ...] = ("solid", (0, (5, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 Place = tuple[float, float]
@@ -47,6 +52,9 @@ def pictures(run: Run) -> Iterator[Section]:
     env = run.part("env")
     if isinstance(env, AbstractEnvironment) and env.max_steps <= MOST:
         yield from _memories(env, policy)
+        if policy.first() is not None:
+            yield from horizon(env, policy)
+            yield from cells(env, policy)
 
 
 # ----------------------------------------------------------------------------------------- graphs
@@ -195,6 +203,45 @@ def _memories(env: AbstractEnvironment, policy: Any) -> Iterator[HeatMap]:
         yield from _map("What the champion remembers", memory, "memory cell")
     for name, rows in heads.items():
         yield from _map(f"Where the champion's {name} is", rows, "row of the memory")
+
+
+def horizon(env: AbstractEnvironment, policy: Any) -> Iterator[Figure]:
+    """How the score falls where something has to be remembered for longer than in training;
+    nothing of a task that has no setting for it."""
+    if env.longer(1) is None:
+        return
+    found = reach(env, tree.single(policy), episodes=PLAYED, key=jax.random.key(SEED))
+    scores = np.array([[step.scores.mean() for step in found]])
+    settings = "; ".join(f"× {step.times}: {step.changed}" for step in found)
+    yield Figure(
+        "How far the champion's memory reaches",
+        "times as long as in training",
+        env.reported,
+        [Curve("champion", [step.times for step in found], scores)],
+        caption=f"{settings}. {PLAYED} fresh episodes of each, without more training; "
+        "`credo evaluate RUN --horizon` plays more.",
+        joined=False,
+    )
+
+
+def cells(env: AbstractEnvironment, policy: Any) -> Iterator[Table]:
+    """What each memory cell is worth: the most needed first, at most `ROWS` of them."""
+    found = worth_of_cells(env, policy, PLAYED, key=jax.random.key(SEED))
+    if found is None:
+        return
+    order = np.lexsort((-found.alone, found.without))[:ROWS]
+    rows: list[list[Cell]] = [
+        [str(i + 1), float(found.without[i]), float(found.alone[i])] for i in order
+    ]
+    cut = f" The {ROWS} most needed of {len(found.alone)} cells." if len(found.alone) > ROWS else ""
+    yield Table(
+        "What its memory cells are worth",
+        ["cell", f"{env.reported} without it", f"{env.reported} with it alone"],
+        rows,
+        caption=f"{env.reported} is {found.score:.3g} with all cells and {found.nothing:.3g} with "
+        f"none: a cell that is left out is held at 0. The same {PLAYED} fresh episodes every "
+        f"time.{cut} Where no cell is missed, several hold the same.",
+    )
 
 
 def _shown(env: AbstractEnvironment) -> AbstractEnvironment:

@@ -1,7 +1,7 @@
 """What `credo evaluate` prints: a champion on fresh episodes."""
 
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from .. import tree
-from ..analysis import bounds, counting
+from ..analysis import bounds, counting, probes
 from ..compilation import float32
 from ..environments.host import AbstractHostEnvironment
 from ..environments.sequence_classification import SequenceClassification
@@ -19,6 +19,7 @@ from ..types import Evaluation
 from .store import Run
 
 EPISODES, HOST_EPISODES = 1000, 20  # a task outside JAX is slower by orders of magnitude
+TIMES = (1, 2, 5, 10, 100)  # as long as in training, of a horizon curve
 STREAMED = 1000  # deeper sequences are streamed: memory does not grow with their length
 
 
@@ -80,6 +81,25 @@ def describe(
         return list(_stream(run, task, episodes, seed)), None
     result = played(run, task, episodes, seed)
     return list(_lines(run, task, result)), result
+
+
+@float32()
+def horizon(
+    run: Run, task: Any, times: Sequence[int], episodes: int | None, seed: int
+) -> Iterator[str]:
+    """Lines about a champion where something has to be remembered for longer than in training.
+
+    **Arguments:** `times`: how many times as long as in `task`, at least 1; none: `TIMES`.
+    `episodes`: of each; None: 100. `seed` as in `played`.
+    """
+    episodes = episodes or 100
+    yield f"{run.path}: {task.reported} in {episodes} fresh episodes of each"
+    policies = tree.single(run.champion)
+    for n in times or TIMES:
+        (found,) = probes.reach(task, policies, (n,), episodes, key=_key(seed))
+        score = _score(found.scores[0])
+        error = "" if np.isnan(score.error) else f" ± {score.error:.2g}"
+        yield f"  {f'× {n:,}':<10} {f'{score.mean:.4g}{error}':<18} {found.changed}"
 
 
 def _score(values: np.ndarray) -> Score:
