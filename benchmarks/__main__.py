@@ -12,6 +12,7 @@ NAMES = (
     "team_generation",
     "td3_update",
     "recurrent_update",
+    "recurrent_ppo",
     "erl_hopper",
     "rover_step",
     "maddpg_update",

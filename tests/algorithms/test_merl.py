@@ -523,3 +523,19 @@ def test_teams_may_be_ranked_by_every_generation_that_they_lived_through():
     for ranked, best in ((algorithm, 0), (ALGORITHM, 1)):
         state, _ = breed(ranked, after, fitness, key=jax.random.key(2))
         assert same(state.champion, tree.take(after.population, best))
+
+
+def test_without_a_local_reward_learners_maximise_that_of_the_team_and_say_so():
+    """Flags can then name another: before, the preset was refused ahead of them."""
+    fleet = ServerFleet(servers=2, devices=4)
+    for preset in (MERL.merl, MERL.hybrid):
+        with pytest.warns(UserWarning, match="ServerFleet has no reward named local: .* net, as"):
+            made = preset(fleet)
+        assert {learner.signal for learner in made.learners} == {None}
+    maze = ExtendedTMaze(robots=2, partner=None, rewards=("score", "difference"))
+    with pytest.warns(UserWarning, match="to name another of difference"):
+        MERL.merl(maze)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        MERL.merl(fleet, learners=())
+        assert MERL.merl(Rover()).learners == (LOCAL,)

@@ -23,6 +23,7 @@ Departures from the printed box:
   rewards are not multiplied by 10.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, Self
@@ -55,6 +56,20 @@ from .overlap import overlapped
 LOCAL = TD3(signal="local", **TEAM)
 """The learner of the team: one twin critic that all agents share (lines 2 and 16-21)."""
 BREEDER = replace(ERL_BREEDER, elite_fraction=0.2, crossover_probability=0.1)
+
+
+def _local(env: Environment) -> TD3:
+    """`LOCAL`, or on a task without such a reward its twin for the task's first one."""
+    if "local" in env.signals:
+        return LOCAL
+    first, *others = env.signals
+    told = f"; give learners.0.signal to name another of {', '.join(others)}" if others else ""
+    warnings.warn(
+        f"{type(env.unwrapped).__name__} has no reward named local: learners maximise {first}, as "
+        f"evolution does{told}",
+        stacklevel=2,
+    )
+    return replace(LOCAL, signal=None)
 
 
 class MERL(Hybrid):
@@ -108,8 +123,12 @@ class MERL(Hybrid):
 
     @classmethod
     def merl(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """The defaults, for the command line. `overrides`: fields of `MERL`, and of its breeder."""
-        settings = in_windows(network, {"learners": (LOCAL,), "updates_per_frame": 0.1})
+        """The defaults, for the command line; of a task without a reward `local` the learner has
+        that of the team, with a warning. `overrides`: fields of `MERL`, and of its breeder."""
+        settings: dict[str, Any] = {"updates_per_frame": 0.1}
+        if "learners" not in overrides:
+            settings |= {"learners": (_local(env),)}
+        settings = in_windows(network, settings)
         return cls(env, network or Team(), **evolving(BREEDER, settings, overrides))
 
     @classmethod
@@ -118,7 +137,9 @@ class MERL(Hybrid):
         judged by fewer episodes in each of the generations they live through, three learners that
         differ by chance, smaller batches, and late local rewards spread. Chosen on seeds from 1000
         on; docs, merl, say by what."""
-        settings: dict[str, Any] = {"learners": 3 * (replace(LOCAL, batch_size=32),)}
+        settings: dict[str, Any] = {}
+        if "learners" not in overrides:
+            settings |= {"learners": 3 * (replace(_local(env), batch_size=32),)}
         settings |= {"population_size": 50, "episodes": 4, "remember": True}
         settings |= {"updates_per_frame": 0.2, "redistribute": Even(late_only=True)}
         settings = in_windows(network, settings)
