@@ -1,9 +1,9 @@
 """PPO with memory on Pendulum-v1: environment frames per CPU second of one core.
 
-Beside RecurrentPPO of sb3-contrib. For both: an LSTM of 64 units for the policy and a memory of its
-own for the critic, which has 2 × 64 units behind it; rounds of 10 episodes of 200 frames, 10 epochs,
-minibatches of 512 frames. Ours follows the policy back through windows of 64 frames, theirs through
-whole episodes where a minibatch has room for them.
+Beside RecurrentPPO of sb3-contrib. For both: an LSTM of 64 units for the policy and a memory of
+its own for the critic, which has 2 × 64 units behind it; rounds of 10 episodes of 200 frames, 10
+epochs, minibatches of 512 frames. Ours follows the policy back through windows of 64 frames, theirs
+through whole episodes where a minibatch has room for them.
 
 CPU seconds are of a contender's process and its live children, after the first rounds.
 """

@@ -1,6 +1,7 @@
 """MERL: who lies in which slot, who learns what when, and what is counted. Teams that meet."""
 
 import dataclasses
+import warnings
 
 import equinox as eqx
 import jax
@@ -19,7 +20,10 @@ from credo.algorithms.neuroevolution import Neuroevolution
 from credo.algorithms.off_policy import OffPolicy
 from credo.algorithms.ppo import PPO
 from credo.compilation import jit
+from credo.environments.extended_tmaze import ExtendedTMaze
 from credo.environments.probes import Copy, Meet
+from credo.environments.rover import Rover
+from credo.environments.server_fleet import ServerFleet
 from credo.learners.credit import Even
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3, matd3
@@ -527,7 +531,7 @@ def test_teams_may_be_ranked_by_every_generation_that_they_lived_through():
 
 def test_without_a_local_reward_learners_maximise_that_of_the_team_and_say_so():
     """Flags can then name another: before, the preset was refused ahead of them."""
-    fleet = ServerFleet(servers=2, devices=4)
+    fleet = ServerFleet(servers=2, devices=4, nefarious=(1, 2))
     for preset in (MERL.merl, MERL.hybrid):
         with pytest.warns(UserWarning, match="ServerFleet has no reward named local: .* net, as"):
             made = preset(fleet)

@@ -50,6 +50,8 @@ EXPERIMENTS = {
     "hybrid-learner": "the hybrid's learner, one ingredient changed at a time",
     "hybrid-ingredients": "the hybrid, one ingredient changed at a time",
     "memory-learned": "memory by evolution, by gradient and by both",
+    "memory-velocities": "TD3 without velocities, with memory and without",
+    "memory-teams": "the T-maze and the server fleet by MERL with memory",
     "check-spread": "MADDPG and MATD3 on simple_spread",
 }
 
@@ -74,6 +76,7 @@ MODULES = {  # of this folder, with the experiments that each has
     "hybrids": ("hybrid-dense", "hybrid-late"),
     "ingredients": ("hybrid-learner", "hybrid-ingredients"),
     "recurrent": ("memory-learned",),
+    "remembering": ("memory-velocities", "memory-teams"),
     "check_spread": ("check-spread",),
 }
 
