@@ -52,17 +52,18 @@ def velocities(budget: str) -> list[Cell]:
     """TD3 on two tasks, seeing three different things; at smoke on one of them, of few frames."""
     plan, small = PLANS[budget], budget == "smoke"
     tasks = ("HalfCheetah-v5", "Hopper-v5")
+    tests: Any = {"start_frames": 200, "test_episodes": 2} if small else {"test_episodes": 10}
     cells = []
     for labels in grid(task=tasks[small:], seen=SEEN):
-        hides, network = SEEN[labels["seen"]]
-        env = Gymnasium(labels["task"])
+        hides, network = SEEN[str(labels["seen"])]
+        env = Gymnasium(str(labels["task"]))
         algorithm = OffPolicy(
             hidden(env, "velocities") if hides else env,
             network,
             learner=TD3(batch_size=BATCH),
             updates_per_frame=plan.updates_per_frame,
             sampling=Sampling(window=64, burn_in=16),
-            **({"start_frames": 200, "test_episodes": 2} if small else {"test_episodes": 10}),
+            **tests,
         )
         cells.append(Cell(labels, algorithm, range(plan.runs), frames=plan.frames))
     return cells
@@ -90,7 +91,7 @@ def teams(budget: str) -> list[Cell]:
     for labels in grid(
         task=("T-maze", "server fleet"), network=("dmmu", "gru"), method=("evolution", "merl")
     ):
-        env, network, signal = _team(labels["task"], labels["network"])
+        env, network, signal = _team(str(labels["task"]), str(labels["network"]))
         learner = replace(LOCAL, signal=signal, batch_size=BATCH)
         algorithm = MERL.merl(
             env,
