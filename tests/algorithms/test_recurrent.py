@@ -15,6 +15,7 @@ from credo.algorithms.merl import LOCAL, MERL
 from credo.algorithms.off_policy import OffPolicy
 from credo.algorithms.ppo import PPO, _rows, _told_in_windows, prepare
 from credo.compilation import jit
+from credo.environments.passive_tmaze import PassiveTMaze
 from credo.environments.probes import Meet, Remember
 from credo.evolution.breeder import Breeder
 from credo.learners.coach import Coached
@@ -210,3 +211,15 @@ def test_presets_have_windows_in_their_batches(preset):
     assert PPO.ppo(TASK, GRU).batch_size == 512
     assert PPO.ppo(TASK, MLP()).batch_size == 64
     assert MERL.hybrid(Meet(), Team(head=GRU)).learners[0].batch_size == 1024
+
+
+def test_presets_see_short_episodes_whole():
+    """A window of 64 cannot hold sign and junction of a corridor of 100 steps together."""
+    gru = Recurrent("gru", 4)
+    for make in (OffPolicy.td3, OffPolicy.sac, OffPolicy.ddpg, ERL.erl, ERL.cerl, ERL.hybrid):
+        assert make(PassiveTMaze(100), gru).sampling == Sampling(window=101, burn_in=0)
+        assert make(PassiveTMaze(10), gru).sampling == Sampling(window=64, burn_in=0)
+        assert make(PassiveTMaze(128), gru).sampling == Sampling(window=64, burn_in=16)
+    ppo = PPO.ppo(PassiveTMaze(100), gru)
+    assert (ppo.window, ppo.batch_size) == (101, 808)
+    assert OffPolicy.td3(PassiveTMaze(100)).sampling == Sampling()

@@ -136,7 +136,7 @@ class ERL(Hybrid):
         ψ, ξ, ω = TABLE_5_1.get(name, TABLE_5_1["HalfCheetah"])
         settings: dict[str, Any] = {"elite_fraction": ψ, "episodes": ξ, "sync_period": ω}
         if overrides.get("learners", True):
-            settings = in_windows(network, settings | {"learners": (ddpg(),)})
+            settings = in_windows(env, network, settings | {"learners": (ddpg(),)})
         network = network or (ERL_NETWORK if env.agents is None else Team())
         return cls(env, network, **evolving(BREEDER, settings, overrides))
 
@@ -152,7 +152,7 @@ class ERL(Hybrid):
         learner = TD3(critic=critic, gamma=0.999, reward_scale=0.01, **rates)
         settings = {"learners": (learner,), "elite_fraction": 0.4, "sync_period": 1}
         settings |= {"remember": True, "redistribute": Even(), "updates_per_frame": 2.0}
-        return cls.erl(env, network, **overridden(in_windows(network, settings), overrides))
+        return cls.erl(env, network, **overridden(in_windows(env, network, settings), overrides))
 
     @classmethod
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
@@ -168,7 +168,7 @@ class ERL(Hybrid):
         if not overrides.get("learners", True):  # evolution alone: nobody to share with or to ask
             settings |= {"share": None, "horizon": None, "redistribute": None}
         elif network is not None and network.remembers:  # the critic cannot judge a last step alone
-            settings = in_windows(network, settings) | {"horizon": None}
+            settings = in_windows(env, network, settings) | {"horizon": None}
         return cls(env, network or HYBRID_NETWORK, **evolving(BREEDER, settings, overrides))
 
     @classmethod
@@ -183,7 +183,7 @@ class ERL(Hybrid):
         learners = tuple(TD3(gamma=γ) for γ in (0.9, 0.99, 0.997, 0.9995))
         settings = {"learners": learners, "workers": 10, "manager": UCB(), "elite_fraction": 0.2}
         settings |= {"sync_period": 5, "test_episodes": 10, "test_every": 5}
-        settings = in_windows(network, settings)
+        settings = in_windows(env, network, settings)
         return cls(env, network or TD3_NETWORK, **evolving(BREEDER, settings, overrides))
 
     @classmethod

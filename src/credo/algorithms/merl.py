@@ -128,7 +128,7 @@ class MERL(Hybrid):
         settings: dict[str, Any] = {"updates_per_frame": 0.1}
         if "learners" not in overrides:
             settings |= {"learners": (_local(env),)}
-        settings = in_windows(network, settings)
+        settings = in_windows(env, network, settings)
         return cls(env, network or Team(), **evolving(BREEDER, settings, overrides))
 
     @classmethod
@@ -142,7 +142,7 @@ class MERL(Hybrid):
             settings |= {"learners": 3 * (replace(_local(env), batch_size=32),)}
         settings |= {"population_size": 50, "episodes": 4, "remember": True}
         settings |= {"updates_per_frame": 0.2, "redistribute": Even(late_only=True)}
-        settings = in_windows(network, settings)
+        settings = in_windows(env, network, settings)
         return cls.merl(env, network or Team(sharing="everything"), **settings | overrides)
 
     @classmethod

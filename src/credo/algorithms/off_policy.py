@@ -80,19 +80,19 @@ class OffPolicy(eqx.Module):
         of each agent's own frames."""
         if env.agents is not None:
             return cls._team(TD3(**TEAM), env, network, overrides)
-        settings = in_windows(network, {"learner": TD3()})
+        settings = in_windows(env, network, {"learner": TD3()})
         return cls(env, network or TD3_NETWORK, **settings | overrides)
 
     @classmethod
     def ddpg(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of ERL's learner (Khadka 2019, section 5.4)."""
-        settings = in_windows(network, {"learner": ddpg(), "start_frames": 1_000})
+        settings = in_windows(env, network, {"learner": ddpg(), "start_frames": 1_000})
         return cls(env, network or ERL_NETWORK, **settings | overrides)
 
     @classmethod
     def sac(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of SAC's authors, with a learned temperature."""
-        settings = in_windows(network, {"learner": SAC(), "start_frames": 10_000})
+        settings = in_windows(env, network, {"learner": SAC(), "start_frames": 10_000})
         return cls(env, network or TD3_NETWORK, **settings | overrides)
 
     @classmethod
@@ -100,7 +100,7 @@ class OffPolicy(eqx.Module):
         """The learner of `ERL.hybrid` alone, with the same network and the same view of rewards."""
         settings: dict[str, Any] = {"learner": modern(), "start_frames": 5_000}
         settings |= {"redistribute": Decomposed()}
-        return cls(env, network or HYBRID_NETWORK, **in_windows(network, settings) | overrides)
+        return cls(env, network or HYBRID_NETWORK, **in_windows(env, network, settings) | overrides)
 
     @classmethod
     def matd3(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
@@ -116,7 +116,7 @@ class OffPolicy(eqx.Module):
     def _team(cls, learner: TD3, env: Environment, network, overrides: dict[str, Any]) -> Self:
         settings: dict[str, Any] = {"learner": learner, "episodes": 10, "start_frames": 5_000}
         settings |= {"updates_per_frame": 0.1, "replay_capacity": 100_000}
-        return cls(env, network or Team(), **in_windows(network, settings) | overrides)
+        return cls(env, network or Team(), **in_windows(env, network, settings) | overrides)
 
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .. import require, tree
 from ..compilation import float32, jit
-from ..learners.base import act, adam, adam_state, averaged, mean
+from ..learners.base import act, adam, adam_state, averaged, mean, window_of
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import Explorer, GaussianNoise
 from ..networks.history import HistoryCriticNetwork, remembering, through
@@ -129,10 +129,11 @@ class PPO(eqx.Module):
     @classmethod
     def ppo(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of its authors for MuJoCo, and what the paper leaves open. For a network
-        with memory minibatches hold 512 frames, which are 8 windows of 64."""
+        with memory minibatches hold 8 windows, of whole episodes where those are short."""
         given: dict[str, Any] = {} if network is None else {"network": network}
         if network is not None and network.remembers:
-            given["batch_size"] = 512
+            window = window_of(env)
+            given |= {"window": window, "batch_size": 8 * window}
         return cls(env, **given | overrides)
 
     @classmethod

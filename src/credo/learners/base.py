@@ -14,6 +14,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from ..compilation import jit
+from ..environments.base import AbstractTask
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.history import by_row, unrolled
 from ..networks.history import moments as seen_in
@@ -24,6 +25,7 @@ from ..types import NOTHING, Batch, Metrics
 Learned = tuple[PyTree, Metrics]  # state and metrics
 Returns = Float[Array, "samples batch *agents"]
 Value = Float[Array, "batch *agents"]
+WHOLE = 128  # steps of an episode that a window has room for
 
 
 class AbstractLearner(eqx.Module):
@@ -76,17 +78,28 @@ class AbstractLearner(eqx.Module):
         """`state` that goes on from a given actor."""
 
 
-def in_windows(network: AbstractNetwork | None, settings: dict[str, Any]) -> dict[str, Any]:
+def window_of(env: AbstractTask) -> int:
+    """Rows of a window on this task: a whole episode, if it has no more than 128 steps, and at
+    least 64. What is asked for at an episode's end was often told at its start."""
+    return max(64, env.max_steps) if env.max_steps <= WHOLE else 64
+
+
+def in_windows(
+    env: AbstractTask, network: AbstractNetwork | None, settings: dict[str, Any]
+) -> dict[str, Any]:
     """Settings of an algorithm with its `learner`, or `learners`, for a network that may have
-    memory: minibatches of at least 1,024 rows, which are 16 windows of 64, and four frames to an
-    update. It costs 2.4 times that of as many frames without memory (docs, recurrent)."""
+    memory: windows of `window_of` the task, behind 16 rows of burn-in where episodes are longer;
+    minibatches of at least 1,024 rows, and four frames to an update. It costs 2.4 times that of as
+    many frames without memory (docs, recurrent)."""
     if network is None or not network.remembers:
         return settings
 
     def larger(learner: Any) -> Any:
         return replace(learner, batch_size=max(learner.batch_size, 1024))
 
-    found = dict(settings)
+    whole = env.max_steps <= WHOLE
+    sampling = Sampling(window=window_of(env), burn_in=0 if whole else 16)
+    found: dict[str, Any] = {"sampling": sampling} | settings
     if "learner" in found:
         found["learner"] = larger(found["learner"])
     if "learners" in found:
