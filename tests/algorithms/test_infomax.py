@@ -56,6 +56,8 @@ def test_entropy_is_in_bits():
         ([HALVES, QUARTERS], 2),
         ([OTHERS, HALVES, QUARTERS], 3),
         ([[np.nan, *HALVES[1:]]], 0),
+        ([[1.0 + 1e-7 * (x > 0) for x in HALVES]], 0),  # rounding says nothing
+        ([[3e38 * x for x in np.sign(np.array(HALVES) - np.mean(HALVES))]], 1),
     ],
 )
 def test_what_is_stored_is_counted_once(columns, bits):

@@ -1175,3 +1175,11 @@ def test_a_task_without_a_horizon_says_so(credo, tmp_path):
     code, _, err = credo(f"evaluate {path} --horizon")
     assert code == 2
     assert "DoublePole has no setting that says for how long" in err
+
+
+def test_a_run_that_ends_before_its_task_begins_says_so(credo, tmp_path):
+    words = "train neuroevolution sequence-recall --depth 1 --network mmu --population-size 4"
+    words += " --infomax infomax --infomax.generations 2 --infomax.episodes 4"
+    told = "was evolved for what its memory knows alone, and not for its task"
+    assert told in credo(f"{words} --generations 2 --path {tmp_path / 'a'}")[2]
+    assert told not in credo(f"{words} --generations 3 --path {tmp_path / 'b'}")[2]

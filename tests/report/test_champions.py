@@ -142,6 +142,7 @@ def test_of_sequences_a_long_one_is_shown_and_empty_rows_are_not(tmp_path):
     assert shown.row_labels == ["1", "2"]
     assert "Nothing reaches 0.01 in the 3 rows" in shown.caption
     assert list(champions._map("Where it is", values * np.nan, "row")) == []
+    assert list(champions._map("What it remembers", values * 0.0, "cell")) == []
 
 
 class TestProbes:

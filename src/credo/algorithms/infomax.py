@@ -31,6 +31,8 @@ from ..networks.base import AbstractNetwork
 from ..networks.graph import GraphPolicy
 from ..rollout import remembered
 
+ROUNDING = 1e-6  # of a cell's largest value: what differs by less is the same
+
 
 class InfoMax(eqx.Module):
     """Fitness in bits for the first generations of a run: what memory cells know of the input."""
@@ -115,10 +117,15 @@ def features(policy: Any, carry: PyTree) -> Any:
 
 def stored(values: Float[Array, "samples cells"], bins: int) -> Float[Array, ""]:
     """The sum over cells of their entropy, each less the most that it shares with an earlier one,
-    in bits. A cell that is not finite everywhere counts as constant."""
+    in bits. A cell that is not finite everywhere counts as constant, and so does one that differs
+    by rounding alone."""
     values = jnp.where(jnp.all(jnp.isfinite(values), axis=0, keepdims=True), values, 0.0)
+    largest = jnp.max(jnp.abs(values), axis=0, keepdims=True)
+    shrunk = jnp.where(largest > 1e19, 1e-19, 1.0)  # so that widths, and one over them, are finite
+    values, largest = shrunk * values, shrunk * largest
     low, high = (f(values, axis=0, keepdims=True) for f in (jnp.min, jnp.max))
-    width = jnp.where(high > low, high - low, 1.0)
+    differs = high - low > ROUNDING * largest
+    values, width = jnp.where(differs, values, low), jnp.where(differs, high - low, 1.0)
     place = jnp.clip(((values - low) / width * bins).astype(jnp.int32), 0, bins - 1)
     hot = jax.nn.one_hot(place, bins)  # [samples, cells, bins]
     n = values.shape[0]

@@ -227,7 +227,7 @@ def _start(command: Train, algorithm: Any) -> None:
         print(run.summary)
         if late and not run.metrics["updates"].any():
             say(f"credo: no gradient update was made in {run.path}: {late}")
-        elif told := _without_injection(algorithm, run):
+        elif told := _without_injection(algorithm, run) or _bits_alone(algorithm, run):
             say(f"credo: {told}")
     if len(runs) > 1:
         print(f"compare them: credo report {path}/seed-*")
@@ -256,6 +256,18 @@ def _without_injection(algorithm: Any, run: Any) -> str:
                 f"and it made {done}: give more --frames{less}"
             )
     return ""
+
+
+def _bits_alone(algorithm: Any, run: Any) -> str:
+    """What to know of a run that ended within the generations of its `infomax`; "" of any other."""
+    infomax, done = getattr(algorithm, "infomax", None), int(run.metrics["generation"][-1])
+    if infomax is None or done > infomax.generations:
+        return ""
+    return (
+        f"{run.path} was evolved for what its memory knows alone, and not for its task: that "
+        f"begins after {infomax.generations} generations, and it made {done}: give more --generations, or "
+        "fewer --infomax.generations"
+    )
 
 
 def _warm_up(algorithm: Any) -> tuple[int, str]:

@@ -16,6 +16,7 @@ from matplotlib.patches import FancyArrowPatch
 from .. import tree
 from ..analysis.memory import known_memory, weightings
 from ..analysis.probes import reach, worth_of_cells
+from ..compilation import float32
 from ..environments.base import AbstractEnvironment, AbstractSequenceTask
 from ..environments.wrappers import Given
 from ..networks.graph import GraphPolicy
@@ -39,7 +40,13 @@ DASHES: tuple[Any, ...] = ("solid", (0, (5, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 
 Place = tuple[float, float]
 
 
-def pictures(run: Run) -> Iterator[Section]:
+def pictures(run: Run) -> list[Section]:
+    """`sections`, with numbers of 32 bits as in training."""
+    with float32():
+        return list(sections(run))
+
+
+def sections(run: Run) -> Iterator[Section]:
     """Of a finished policy what can be shown; nothing of a network that is not Credo's own, or has
     neither a graph nor a memory."""
     own = run.config["algorithm"]["class"].startswith("credo.") and "task" in run.config
@@ -258,8 +265,8 @@ def _map(says: str, values: Any, what: str) -> Iterator[HeatMap]:
     """What is there at each moment, `[moments, rows]`; nothing if a number is not finite."""
     moments = len(values)
     shown = np.asarray(values, np.float64)[:LONGEST].T
-    if not np.isfinite(shown).all():
-        return
+    if not np.isfinite(shown).all() or not np.abs(shown).max(initial=0.0) >= FAINT:
+        return  # a network may have room for cells of which it uses none
     cut = f" The first {LONGEST} of {moments} moments." if moments > LONGEST else ""
     used = 1 + int(np.max(np.flatnonzero(np.max(np.abs(shown), axis=1) >= FAINT), initial=0))
     if used < len(shown):

@@ -356,7 +356,7 @@ def _pictures(runs: Groups) -> list[Section]:
     if len(every) != 1:
         return []
     try:
-        return list(champions.pictures(every[0]))
+        return champions.pictures(every[0])
     except Exception as error:  # whatever a stranger's file holds, the numbers of its log are shown
         return [Text("Champion", [f"Not drawn: {str(error).rstrip('.; ')}."])]
 
