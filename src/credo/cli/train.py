@@ -265,8 +265,8 @@ def _bits_alone(algorithm: Any, run: Any) -> str:
         return ""
     return (
         f"{run.path} was evolved for what its memory knows alone, and not for its task: that "
-        f"begins after {infomax.generations} generations, and it made {done}: give more --generations, or "
-        "fewer --infomax.generations"
+        f"begins after {infomax.generations} generations, and it made {done}: give more "
+        "--generations, or fewer --infomax.generations"
     )
 
 
