@@ -63,17 +63,39 @@ def fits(env: Any, network: Any, *learners: Any) -> None:
     team = env.agents is not None
     unfit = [learner for learner in learners if team and not learner.teams]
     if unfit:
-        raise ValueError(_cannot_learn(env, f"{env.agents} agents", unfit))
+        has, instead = f"{env.agents} agents", "Teams learn by TD3 (credo train merl, matd3)"
+        raise ValueError(_cannot_learn(env, has, instead, unfit))
     if network.team != team:
         raise ValueError(_other_team(env, network))
     if not team and any(getattr(learner, "together", False) for learner in learners):
         raise ValueError(_one_alone(env))
 
 
-def continuous(env: Any, *learners: Any) -> None:
-    """Actions that learners can follow a gradient through. It opens a task outside JAX."""
-    if learners and env.discrete:
-        raise ValueError(_cannot_learn(env, "Discrete actions", learners))
+def actions(env: Any, network: Any, *learners: Any) -> None:
+    """Learners that can learn a task's kind of actions. It opens a task outside JAX."""
+    for learner in learners:
+        if learner.discrete or env.discrete:
+            choices(env, network, learner)
+
+
+def choices(env: Any, network: Any, learner: Any) -> None:
+    """Discrete actions that a learner can learn, by a network that can say them. All have to be
+    allowed at every step, or what it says would not be what is done; and the largest output has to
+    be found whatever its size, which a learner makes as large as it likes."""
+    if not env.discrete:
+        raise ValueError(_cannot_learn(env, "Box actions", "Give TD3, DDPG or SAC", [learner]))
+    if not learner.discrete:
+        others = "Give DQN (credo train dqn, erl, cerl), or train it by ppo"
+        raise ValueError(_cannot_learn(env, "Discrete actions", others, [learner]))
+    if env.masked:
+        others = "Give a task that allows every action"
+        raise ValueError(_cannot_learn(env, "an action_mask", others, [learner]))
+    if getattr(network, "output_activation", None) != "relative":
+        task, name = getattr(env, "id", type(env).__name__), type(network).__name__
+        raise ValueError(
+            f"{task} has Discrete actions, of which learners by gradient choose by outputs of any "
+            f"size: give {name} output_activation='relative'"
+        )
 
 
 def _other_team(env: Any, network: Any) -> str:
@@ -96,12 +118,11 @@ def _one_alone(env: Any) -> str:
     )
 
 
-def _cannot_learn(env: Any, has: str, learners: Iterable[Any]) -> str:
+def _cannot_learn(env: Any, has: str, instead: str, learners: Iterable[Any]) -> str:
+    task, names = getattr(env, "id", type(env).__name__), (type(x).__name__ for x in learners)
     return (
-        f"{getattr(env, 'id', type(env).__name__)} has {has}: "
-        f"{', '.join(type(learner).__name__ for learner in learners)} cannot learn that. Evolve "
-        "without a learner (credo train ea), or give a task with Box actions; teams learn by TD3 "
-        "(credo train merl, matd3)"
+        f"{task} has {has}: {', '.join(names)} cannot learn that. {instead}, or evolve without a "
+        "learner (credo train ea)"
     )
 
 

@@ -364,7 +364,7 @@ ACTIVATIONS = {
 
 def _act(x: np.ndarray, activation: str) -> tuple[np.ndarray, np.ndarray]:
     """The output, and as an action in [-1, 1]."""
-    y = ACTIVATIONS[activation](x)
+    y = np.tanh(x - x.max()) if activation == "relative" else ACTIVATIONS[activation](x)
     return y, 2.0 * y - 1.0 if activation == "sigmoid" else y
 
 

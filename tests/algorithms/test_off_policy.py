@@ -16,14 +16,17 @@ from credo.algorithms.off_policy import OffPolicy
 from credo.algorithms.ppo import PPO
 from credo.compilation import jit
 from credo.environments.gymnasium import Gymnasium
-from credo.environments.probes import Copy, Meet
+from credo.environments.probes import Choose, Copy, Meet
 from credo.environments.wrappers import delayed
 from credo.learners import td3 as learners
+from credo.learners.dqn import DQN
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3, ddpg
 from credo.networks.exploration import OrnsteinUhlenbeck
 from credo.networks.mlp import MLP, Critic
+from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team
+from credo.replay import Sampling
 from credo.types import NOTHING
 
 FAST = {"actor_lr": 0.01, "critic_lr": 0.01, "tau": 0.05, "gamma": 0.5, "batch_size": 64}
@@ -171,17 +174,83 @@ def test_a_policy_that_goes_on_is_tested_at_once():
     assert same(after.champion, ALGORITHM.learner.actor(after.learner))
 
 
-@pytest.mark.parametrize("build", [OffPolicy, PPO, ERL])
-@pytest.mark.parametrize(
-    ("env", "told"),
-    [
-        (Gymnasium("CartPole-v1", in_process=True), "CartPole-v1 has Discrete actions"),
-        (delayed(Gymnasium("CartPole-v1", in_process=True)), "has Discrete actions"),
-    ],
-)
-def test_tasks_without_a_gradient_are_refused(build, env, told):
-    with pytest.raises(ValueError, match=told + r".*Evolve without a learner \(credo train ea\)"):
-        build(env).init(key=jax.random.key(0))
+CART = Gymnasium("CartPole-v1", in_process=True)
+
+
+@pytest.mark.parametrize("build", [OffPolicy, ERL])
+@pytest.mark.parametrize("env", [CART, delayed(CART), Choose()])
+def test_tasks_without_a_gradient_are_refused(build, env):
+    told = (
+        r"has Discrete actions: (TD3|DDPG) cannot learn that\. Give DQN .* evolve without a learner"
+    )
+    with pytest.raises(ValueError, match=told):
+        build(env, MLP((4,))).init(key=jax.random.key(0))
+
+
+def test_dqn_is_refused_where_there_is_nothing_to_choose():
+    with pytest.raises(ValueError, match=r"Copy has Box actions: DQN cannot .* Give TD3, DDPG or"):
+        OffPolicy.dqn(Copy()).init(key=jax.random.key(0))
+
+
+@pytest.mark.parametrize("build", [OffPolicy.dqn, PPO.ppo, ERL.erl])
+def test_outputs_that_saturate_are_refused_where_they_choose(build):
+    with pytest.raises(ValueError, match="give MLP output_activation='relative'"):
+        build(Choose(), MLP((4,))).init(key=jax.random.key(0))
+
+
+CHOOSING = {
+    "dqn": lambda: OffPolicy.dqn(
+        Choose(),
+        MLP((16,), "tanh", initializer="fan_in", output_activation="relative"),
+        learner=DQN(learning_rate=0.01, tau=0.1, gamma=0.5, exploration=100, batch_size=32),
+        **SETTINGS | {"test_every": 100},
+    ),
+    "dqn with memory": lambda: OffPolicy.dqn(
+        Choose(),
+        Recurrent("gru", 16, "relative", "fan_in"),
+        learner=DQN(learning_rate=0.01, tau=0.1, gamma=0.5, exploration=100, batch_size=64),
+        sampling=Sampling(window=10, burn_in=0),
+        updates_per_frame=0.5,
+        **SETTINGS | {"test_every": 100},
+    ),
+    "ppo": lambda: PPO.ppo(
+        Choose(),
+        horizon=160,
+        copies=16,
+        batch_size=40,
+        learning_rate=3e-3,
+        entropy_weight=0.01,
+        test_every=100,
+    ),
+    "ppo with memory": lambda: PPO.ppo(
+        Choose(),
+        Recurrent("gru", 16, "relative", "fan_in"),
+        window=10,
+        horizon=160,
+        copies=16,
+        batch_size=40,
+        learning_rate=3e-3,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CHOOSING)
+def test_it_learns_to_choose(name):
+    """By chance 3.3 of 10 are right."""
+    rows, _ = run(CHOOSING[name](), 40)
+    assert max(row["champion_score"] for row in rows[-5:]) >= 9.5
+    assert rows[0]["fitness_mean"] < 6.0
+
+
+def test_a_population_and_dqn_learn_to_choose_together():
+    network = MLP((8,), "tanh", initializer="fan_in", output_activation="relative")
+    learner = DQN(learning_rate=0.01, tau=0.1, gamma=0.5, exploration=100, batch_size=32)
+    settings = {"population_size": 4, "elite_fraction": 0.25, "sync_period": 1}
+    algorithm = ERL.erl(
+        Choose(), network, learners=(learner,), warmup_frames=50, replay_capacity=1000, **settings
+    )
+    rows, _ = run(algorithm, 30)
+    assert rows[-1]["champion_score"] >= 9.5
 
 
 def test_evolution_takes_discrete_actions():
@@ -216,7 +285,7 @@ def test_presets_have_the_constants_of_their_authors():
         name: make(Meet() if name in teams else Copy())
         for name, make in OffPolicy.presets().items()
     }
-    assert set(presets) == {"td3", "ddpg", "sac", "matd3", "maddpg", "hybrid"}
+    assert set(presets) == {"td3", "ddpg", "sac", "dqn", "matd3", "maddpg", "hybrid"}
     td3, sac = presets["td3"], presets["sac"]
     assert isinstance(td3.learner, TD3)
     assert (td3.start_frames, td3.network.hidden, td3.learner.policy_delay) == (

@@ -10,11 +10,14 @@ import pytest
 from compilations import compilations
 from walk import HostWalk
 
-from credo.algorithms.ppo import PPO, Actor, Sample, advantages, improve, prepare, surrogate
+from credo.algorithms.ppo import PPO, Actor, Choice, Sample, advantages, improve, prepare, surrogate
 from credo.compilation import jit
+from credo.environments.passive_tmaze import PassiveTMaze
 from credo.environments.probes import Copy
 from credo.learners.base import act
+from credo.networks.exploration import Categorical
 from credo.networks.mlp import MLP, Critic
+from credo.networks.recurrent import Recurrent
 
 SMALL = {
     "network": MLP(hidden=(8,), initializer="fan_in", output_scale=0.01),
@@ -116,3 +119,51 @@ def test_on_a_host_task_nothing_compiles_after_the_first_generation():
             frames.add(int(metrics["frames"]))
         assert i < 2 or events == []
     assert len(frames) > 1
+
+
+@pytest.mark.parametrize("length", [1, 10])
+def test_windows_of_short_episodes_are_learned_from(length):
+    """A round of frames that fills no minibatch once ended in an error, and had no update."""
+    network = Recurrent("gru", 4, "tanh", "fan_in")
+    for fields in ({}, {"window": 8, "batch_size": 64}):
+        ppo = PPO.ppo(PassiveTMaze(length), network, copies=4, epochs=1, **fields)
+        state = jit(ppo.init)(key=jax.random.key(0))
+        after, metrics = jit(ppo.generation)(state, key=jax.random.key(1))
+        assert np.isfinite(metrics["policy_loss"])
+        assert metrics["critic_loss"] > 0
+        before = jax.tree.leaves(state.actor)
+        assert any(
+            (a != b).any() for a, b in zip(before, jax.tree.leaves(after.actor), strict=True)
+        )
+
+
+def test_a_minibatch_that_is_never_full_is_refused():
+    with pytest.raises(ValueError, match="batch_size is 64 and horizon is 32: a round of frames"):
+        PPO(Copy(), batch_size=64, horizon=32)
+
+
+def test_the_entropy_of_a_gaussian_and_of_a_choice():
+    actor = Actor(MLP((2,)).init(1, 2, key=jax.random.key(0)), jnp.log(jnp.array([0.5, 2.0])))
+    expected = np.log(0.5) + np.log(2.0) + np.log(2 * np.pi * np.e)
+    np.testing.assert_allclose(actor.entropy(jnp.zeros((3, 2))), expected, rtol=1e-6)
+    choice = Choice(actor.mean)
+    said = jnp.log(jnp.array([[0.5, 0.25, 0.25], [1 / 3, 1 / 3, 1 / 3]]))
+    np.testing.assert_allclose(choice.entropy(said), [1.5 * np.log(2), np.log(3)], rtol=1e-6)
+    taken = jnp.array([[-1.0, 1.0, -1.0], [1.0, -1.0, -1.0]])
+    density = np.exp(choice.log_density(said + 7.0, taken))  # logits have no level
+    np.testing.assert_allclose(density, [0.25, 1 / 3], rtol=1e-5)
+
+
+def test_actions_are_drawn_with_the_probabilities_of_the_softmax():
+    policy = MLP((), output_activation="relative").init(1, 3, key=jax.random.key(0))
+    said = np.asarray(policy.spoken(jnp.ones(1), ())[1])
+    explorer = Categorical(policy)
+
+    def step(carry, _):
+        action, carry = explorer(jnp.ones(1), carry)
+        return carry, action
+
+    _, drawn = jax.lax.scan(step, explorer.start(key=jax.random.key(1)), length=20_000)
+    assert set(np.unique(drawn)) == {-1.0, 1.0}
+    expected = np.exp(said) / np.exp(said).sum()
+    np.testing.assert_allclose((np.asarray(drawn) > 0).mean(axis=0), expected, atol=0.015)

@@ -208,7 +208,7 @@ def test_presets_have_windows_in_their_batches(preset):
     assert ERL.hybrid(TASK, MLP()).horizon is not None
     assert ERL.cerl(TASK, GRU).learners[3].batch_size == 1024
     assert ERL.ea(TASK, GRU).updates_per_frame == 1.0
-    assert PPO.ppo(TASK, GRU).batch_size == 512
+    assert PPO.ppo(TASK, GRU).batch_size == 8 * TASK.max_steps
     assert PPO.ppo(TASK, MLP()).batch_size == 64
     assert MERL.hybrid(Meet(), Team(head=GRU)).learners[0].batch_size == 1024
 
@@ -218,7 +218,7 @@ def test_presets_see_short_episodes_whole():
     gru = Recurrent("gru", 4)
     for make in (OffPolicy.td3, OffPolicy.sac, OffPolicy.ddpg, ERL.erl, ERL.cerl, ERL.hybrid):
         assert make(PassiveTMaze(100), gru).sampling == Sampling(window=101, burn_in=0)
-        assert make(PassiveTMaze(10), gru).sampling == Sampling(window=64, burn_in=0)
+        assert make(PassiveTMaze(10), gru).sampling == Sampling(window=11, burn_in=0)
         assert make(PassiveTMaze(128), gru).sampling == Sampling(window=64, burn_in=16)
     ppo = PPO.ppo(PassiveTMaze(100), gru)
     assert (ppo.window, ppo.batch_size) == (101, 808)

@@ -8,7 +8,9 @@ import jax
 import numpy as np
 import pytest
 
+from credo.algorithms.erl import ERL
 from credo.algorithms.off_policy import OffPolicy
+from credo.algorithms.ppo import PPO
 from credo.environments import checks, foreign
 from credo.environments.adapters import Single
 from credo.environments.foreign import close_all
@@ -128,6 +130,18 @@ def test_the_largest_entry_that_is_allowed_is_played(where):
     paid = [copies.step(action, on).rewards["reward"][0] for _ in range(4)]
     assert paid == [13.0, 11.0, 13.0, 11.0]
     assert action.tolist() == np.float32([[0.1, 0.9, 0.8, 0.3]]).tolist()
+
+
+@pytest.mark.parametrize("where", ["obs", "info"])
+def test_learners_are_refused_where_actions_are_forbidden(where):
+    """What they said would not be what was done."""
+    env = here("Masked", where=where)
+    assert env.masked
+    assert not here("Grid").masked
+    for build in (OffPolicy.dqn, PPO.ppo, ERL.erl):
+        with pytest.raises(ValueError, match=r"has an action_mask: \w+ cannot learn that\. Give"):
+            build(env).init(key=jax.random.key(0))
+    ERL.ea(env).init(key=jax.random.key(0))
 
 
 def test_a_mask_that_allows_nothing_is_a_fault_but_at_the_end():

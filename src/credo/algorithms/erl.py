@@ -40,6 +40,7 @@ from ..learners.base import AbstractLearner, in_windows
 from ..learners.coach import AbstractCoach
 from ..learners.credit import AbstractRedistribution, Even
 from ..learners.decomposed import Decomposed
+from ..learners.dqn import DQN, choosing
 from ..learners.horizon import AbstractHorizon, Truncated
 from ..learners.manager import UCB, AbstractManager
 from ..learners.sac import HYBRID_NETWORK, modern
@@ -136,8 +137,9 @@ class ERL(Hybrid):
         ψ, ξ, ω = TABLE_5_1.get(name, TABLE_5_1["HalfCheetah"])
         settings: dict[str, Any] = {"elite_fraction": ψ, "episodes": ξ, "sync_period": ω}
         if overrides.get("learners", True):
-            settings = in_windows(env, network, settings | {"learners": (ddpg(),)})
-        network = network or (ERL_NETWORK if env.agents is None else Team())
+            settings |= {"learners": (DQN() if env.discrete else ddpg(),)}
+            settings = in_windows(env, network, settings)
+        network = network or (Team() if env.agents is not None else choosing(env, ERL_NETWORK))
         return cls(env, network, **evolving(BREEDER, settings, overrides))
 
     @classmethod
@@ -180,11 +182,13 @@ class ERL(Hybrid):
     def cerl(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """Chapter 6: TD3 at four discounts, ten workers, UCB. What the text leaves open is the
         author's: ω = 5, a fifth are elites."""
-        learners = tuple(TD3(gamma=γ) for γ in (0.9, 0.99, 0.997, 0.9995))
+        kind = DQN if env.discrete else TD3
+        learners = tuple(kind(gamma=γ) for γ in (0.9, 0.99, 0.997, 0.9995))
         settings = {"learners": learners, "workers": 10, "manager": UCB(), "elite_fraction": 0.2}
         settings |= {"sync_period": 5, "test_episodes": 10, "test_every": 5}
         settings = in_windows(env, network, settings)
-        return cls(env, network or TD3_NETWORK, **evolving(BREEDER, settings, overrides))
+        network = network or choosing(env, TD3_NETWORK)
+        return cls(env, network, **evolving(BREEDER, settings, overrides))
 
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:

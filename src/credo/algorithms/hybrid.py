@@ -150,7 +150,7 @@ class Hybrid(eqx.Module):
     def init(self, *, key: PRNGKeyArray) -> HybridState:
         """1-4: Initialize learners, a population of k actors, and an empty cyclic replay buffer."""
         env, network, k, q = self.env, self.network, self.population_size, len(self.learners)
-        require.continuous(env, *self.learners)
+        require.actions(env, network, *self.learners)
         draw_key, *keys = jax.random.split(key, 1 + q)
         pairs = zip(self.learners, keys, strict=True)
         population = draw(network, env.sizes, k, key=draw_key)

@@ -19,6 +19,7 @@ from ..compilation import float32
 from ..learners.base import AbstractLearner, in_windows, learn, require_windows
 from ..learners.credit import AbstractRedistribution
 from ..learners.decomposed import Decomposed
+from ..learners.dqn import DQN, DQN_NETWORK
 from ..learners.sac import HYBRID_NETWORK, SAC, modern
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, TEAM, ddpg, maddpg, matd3
 from ..networks.base import AbstractNetwork, AbstractPolicy
@@ -96,6 +97,12 @@ class OffPolicy(eqx.Module):
         return cls(env, network or TD3_NETWORK, **settings | overrides)
 
     @classmethod
+    def dqn(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
+        """Discrete actions: double Q-learning, with an update per frame."""
+        settings = in_windows(env, network, {"learner": DQN(), "start_frames": 1_000})
+        return cls(env, network or DQN_NETWORK, **settings | overrides)
+
+    @classmethod
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The learner of `ERL.hybrid` alone, with the same network and the same view of rewards."""
         settings: dict[str, Any] = {"learner": modern(), "start_frames": 5_000}
@@ -121,7 +128,7 @@ class OffPolicy(eqx.Module):
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
         """Settings by name, for the command line."""
-        names = ("td3", "ddpg", "sac", "matd3", "maddpg", "hybrid")
+        names = ("td3", "ddpg", "sac", "dqn", "matd3", "maddpg", "hybrid")
         return {name: getattr(cls, name) for name in names}
 
     @property
@@ -133,7 +140,7 @@ class OffPolicy(eqx.Module):
     def init(self, *, key: PRNGKeyArray) -> OffPolicyState:
         """A fresh learner and an empty replay buffer."""
         env = self.env
-        require.continuous(env, self.learner)
+        require.actions(env, self.network, self.learner)
         learner = self.learner.init(self.network, *env.sizes, key=key)
         moments = Moments.first(env, self.network) if self.normalize_observations else None
         return OffPolicyState(

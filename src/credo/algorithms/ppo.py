@@ -21,8 +21,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from .. import require, tree
 from ..compilation import float32, jit
 from ..learners.base import act, adam, adam_state, averaged, mean, window_of
+from ..learners.dqn import choosing
 from ..networks.base import AbstractNetwork, AbstractPolicy
-from ..networks.exploration import Explorer, GaussianNoise
+from ..networks.exploration import Categorical, Explorer, GaussianNoise
 from ..networks.history import HistoryCriticNetwork, remembering, through
 from ..networks.mlp import MLP, AbstractCriticNetwork, Critic
 from ..normalization import Moments, behind, frozen, seen, warmed, watched
@@ -30,6 +31,9 @@ from ..replay import Replay, extend
 from ..rollout import Environment, blank, collect
 from ..types import Metrics, Transition
 from .fitness import objective, retested
+
+NETWORK = MLP(hidden=(64, 64), activation="tanh", initializer="fan_in", output_scale=0.01)
+METRICS = ("policy_loss", "critic_loss", "clipped", "entropy")
 
 
 class Actor(eqx.Module):
@@ -45,8 +49,55 @@ class Actor(eqx.Module):
         each = -0.5 * jnp.square(z) - self.log_std[None] - 0.5 * jnp.log(2.0 * jnp.pi)
         return jnp.sum(each, axis=1)
 
+    def entropy(self, mean: Float[Array, "batch act"]) -> Float[Array, " batch"]:
+        each = self.log_std + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e)
+        return jnp.broadcast_to(jnp.sum(each), mean.shape[:1])
 
-Networks = tuple[Actor, AbstractCriticNetwork]
+    def says(self, policy: AbstractPolicy) -> Callable[..., Any]:
+        """What `log_density` takes, step by step: actions."""
+        return policy
+
+    def told(self, obs: Float[Array, "rows obs"]) -> Float[Array, "rows act"]:
+        """The same of a policy without memory, for a batch."""
+        return act(self.mean, obs)
+
+    def explorer(self, size: int) -> AbstractPolicy:
+        """Who plays, for actions of so many numbers."""
+        std: Any = jnp.exp(self.log_std)
+        return Explorer(self.mean, GaussianNoise(std), jnp.bool_(False), size, clipped=False)
+
+
+class Choice(eqx.Module):
+    """A distribution over discrete actions, softmax of what a policy says before its output
+    activation. Of an action the largest entry is the one that was taken."""
+
+    mean: AbstractPolicy  # whose largest output is the likeliest action
+
+    def log_density(
+        self, said: Float[Array, "batch act"], action: Float[Array, "batch act"]
+    ) -> Float[Array, " batch"]:
+        taken = jnp.argmax(action, axis=1, keepdims=True)
+        return jnp.take_along_axis(jax.nn.log_softmax(said, axis=1), taken, axis=1)[:, 0]
+
+    def entropy(self, said: Float[Array, "batch act"]) -> Float[Array, " batch"]:
+        log_p = jax.nn.log_softmax(said, axis=1)
+        return -jnp.sum(jnp.exp(log_p) * log_p, axis=1)
+
+    def says(self, policy: AbstractPolicy) -> Callable[..., Any]:
+        def step(obs, carry):
+            _, said, carry = policy.spoken(obs, carry)
+            return said, carry
+
+        return step
+
+    def told(self, obs: Float[Array, "rows obs"]) -> Float[Array, "rows act"]:
+        return self.mean.spoken(obs.T, ())[1].T
+
+    def explorer(self, size: int) -> AbstractPolicy:
+        return Categorical(self.mean)
+
+
+Networks = tuple[Actor | Choice, AbstractCriticNetwork]
 
 
 class Sample(eqx.Module):
@@ -67,7 +118,7 @@ class Sample(eqx.Module):
 class PPOState(eqx.Module):
     """What PPO knows between two generations."""
 
-    actor: Actor
+    actor: Actor | Choice
     critic: AbstractCriticNetwork
     optimizer: optax.OptState
     replay: Replay  # the frames of one generation
@@ -83,11 +134,10 @@ class PPO(eqx.Module):
 
     default_budget: ClassVar[dict[str, int]] = {"frames": 1_000_000}
     teams: ClassVar[bool] = False
+    discrete: ClassVar[bool] = True  # and others too
 
     env: Environment
-    network: AbstractNetwork = MLP(
-        hidden=(64, 64), activation="tanh", initializer="fan_in", output_scale=0.01
-    )
+    network: AbstractNetwork = NETWORK
     critic: Critic = Critic(hidden=(64, 64), activation="tanh", initializer="fan_in")
     horizon: int = eqx.field(static=True, default=2048)  # frames between updates, about, ≥ 1
     copies: int = eqx.field(static=True, default=32)  # episodes between rounds, at most; ≥ 1
@@ -101,6 +151,7 @@ class PPO(eqx.Module):
     learning_rate: float = 3e-4  # of Adam, at least 0
     value_weight: float = 0.5  # of the critic's squared error in the loss, at least 0
     max_norm: float = 0.5  # norm to which the gradient is clipped, at least 0
+    entropy_weight: float = 0.0  # of the policy's entropy in the objective, at least 0
     first_std: float = 0.6  # of the noise at first, ≥ 0, in units of actions, which lie in [-1, 1]
     test_episodes: int = eqx.field(static=True, default=10)  # episodes of a policy's test, ≥ 1
     test_every: int = eqx.field(static=True, default=5_000)  # frames between tests, at least 1
@@ -120,9 +171,21 @@ class PPO(eqx.Module):
                 f"batch_size is {self.batch_size} and window is {self.window}: a network with "
                 "memory learns from whole windows; give a larger batch_size, or a smaller window"
             )
+        if self.batch_size > self.horizon and not self.network.remembers:
+            raise ValueError(
+                f"batch_size is {self.batch_size} and horizon is {self.horizon}: a round of frames "
+                "would not fill one minibatch; give a smaller batch_size, or a larger horizon"
+            )
         for name in ("gamma", "gae"):
             require.within(name, getattr(self, name), 0, 1)
-        for name in ("clip", "learning_rate", "value_weight", "max_norm", "first_std"):
+        for name in (
+            "clip",
+            "learning_rate",
+            "value_weight",
+            "max_norm",
+            "first_std",
+            "entropy_weight",
+        ):
             require.at_least(name, getattr(self, name), 0)
         objective(self.env, self.signal)
 
@@ -130,7 +193,7 @@ class PPO(eqx.Module):
     def ppo(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of its authors for MuJoCo, and what the paper leaves open. For a network
         with memory minibatches hold 8 windows, of whole episodes where those are short."""
-        given: dict[str, Any] = {} if network is None else {"network": network}
+        given: dict[str, Any] = {"network": network or choosing(env, NETWORK)}
         if network is not None and network.remembers:
             window = window_of(env)
             given |= {"window": window, "batch_size": 8 * window}
@@ -145,10 +208,12 @@ class PPO(eqx.Module):
     def init(self, *, key: PRNGKeyArray) -> PPOState:
         """Fresh networks, and room for the frames of one generation."""
         env = self.env
-        require.continuous(env, self)
+        if env.discrete:
+            require.choices(env, self.network, self)
         actor_key, critic_key = jax.random.split(key)
         mean = self.network.init(env.obs_size, env.action_size, key=actor_key)
-        actor = Actor(mean, jnp.full(env.action_size, jnp.log(self.first_std)))
+        std = jnp.full(env.action_size, jnp.log(self.first_std))
+        actor = Choice(mean) if env.discrete else Actor(mean, std)
         values = self.critic if mean.first() is None else remembering(self.critic)
         critic = values.init(env.obs_size, 0, key=critic_key)  # a value of states
         # Room for a round of episodes that are all much longer than the last ones.
@@ -173,9 +238,8 @@ class PPO(eqx.Module):
 
         # Run the policy for about T frames.
         wanted = jnp.clip(jnp.ceil(self.horizon / state.length).astype(jnp.int32), 1, self.copies)
-        std: Any = jnp.exp(state.actor.log_std)
-        explorer = (state.actor.mean, GaussianNoise(std), jnp.bool_(False), self.env.action_size)
-        explorer = behind(state.moments, tree.single(Explorer(*explorer, clipped=False)))
+        explorer = state.actor.explorer(self.env.action_size)
+        explorer = behind(state.moments, tree.single(explorer))
         how = {"wanted": wanted, "common": False, "key": explore_key}
         played, experience = collect(self.env, explorer, self.copies, **how)
         empty = Replay(state.replay.data, jnp.int32(0))
@@ -209,7 +273,7 @@ class PPO(eqx.Module):
     def warm(self, state: PPOState, policy: AbstractPolicy) -> PPOState:
         """`state` that goes on from a saved policy of the same network."""
         mean, moments = warmed(policy, state.moments)
-        actor = Actor(mean, state.actor.log_std)
+        actor = replace(state.actor, mean=mean)
         return replace(state, actor=actor, champion=policy, moments=moments)
 
 
@@ -222,13 +286,15 @@ def improve(
     moments: Any = None,
     *,
     key: Any,
-) -> tuple[Actor, AbstractCriticNetwork, optax.OptState, Metrics]:
+) -> tuple[Actor | Choice, AbstractCriticNetwork, optax.OptState, Metrics]:
     """K epochs of minibatches of M frames. How many frames there are is data."""
     sample = prepare(ppo, networks, replay, moments)
     together = ppo.window if sample.begins is not None else 1  # rows that stay together
-    pieces, some = -(-replay.capacity // together), max(ppo.batch_size // together, 1)
+    pieces = -(-replay.capacity // together)
+    some = min(max(ppo.batch_size // together, 1), pieces)
     ready = -(-replay.size // together)
-    batches = ready // some
+    # Windows say which of their rows are frames, so that a minibatch need not be full.
+    batches = jnp.maximum(ready // some, 1) if together > 1 else ready // some
     weights, static = eqx.partition(networks, eqx.is_inexact_array)
 
     def epoch(k, loop):
@@ -248,7 +314,7 @@ def improve(
 
         return jax.lax.fori_loop(0, batches, step, loop)
 
-    zeros = {name: jnp.float32(0.0) for name in ("policy_loss", "critic_loss", "clipped")}
+    zeros = {name: jnp.float32(0.0) for name in METRICS}
     weights, opt, total = jax.lax.fori_loop(0, ppo.epochs, epoch, (weights, opt, zeros))
     actor, critic = eqx.combine(weights, static)
     return actor, critic, opt, averaged(total, ppo.epochs * batches)
@@ -269,7 +335,7 @@ def prepare(ppo: PPO, networks: Networks, replay: Replay, moments: Moments | Non
         means, value, after, memories = _told_in_order(networks, obs, next_obs, begins)
         before = {"counts": filled, "begins": begins, "memories": memories}
     else:
-        means, value, after = act(actor.mean, obs), _value(critic, obs), _value(critic, next_obs)
+        means, value, after = actor.told(obs), _value(critic, obs), _value(critic, next_obs)
     delta = reward + ppo.gamma * jnp.where(rows.terminated, 0.0, after) - value
     # Rows come episode by episode.
     goes_on = ~over & jnp.append(filled[1:], False)
@@ -304,7 +370,7 @@ def surrogate(ppo: PPO, networks: Networks, rows: Sample) -> tuple[Float[Array, 
     """Minus the clipped objective (equation 7) and the critic's squared error."""
     actor, critic = networks
     if rows.memories is None:
-        means, value = act(actor.mean, rows.obs), _value(critic, rows.obs)
+        means, value = actor.told(rows.obs), _value(critic, rows.obs)
     else:
         means, value = _told_in_windows(ppo, networks, rows)
     change = actor.log_density(means, rows.action) - rows.log_density
@@ -316,8 +382,11 @@ def surrogate(ppo: PPO, networks: Networks, rows: Sample) -> tuple[Float[Array, 
     policy_loss = -mean(gain, rows.counts)
     critic_loss = mean(jnp.square(value - rows.value), rows.counts)
     clipped = mean((ratio != bounded).astype(jnp.float32), rows.counts)
+    entropy = mean(actor.entropy(means), rows.counts)
     metrics = {"policy_loss": policy_loss, "critic_loss": critic_loss, "clipped": clipped}
-    return policy_loss + ppo.value_weight * critic_loss, metrics
+    metrics |= {"entropy": entropy}
+    loss = policy_loss + ppo.value_weight * critic_loss - ppo.entropy_weight * entropy
+    return loss, metrics
 
 
 def _rows(sample: Sample, pieces: Int[Array, " some"], together: int) -> Sample:
@@ -337,7 +406,7 @@ def _told_in_order(networks: Networks, obs: Array, next_obs: Array, begins: Arra
     what both remembered before each.
     """
     actor, critic = networks[0], _with_history(networks[1])
-    means, remembered = through(actor.mean, obs, begins)
+    means, remembered = through(actor.mean, obs, begins, said=actor.says)
 
     def ahead(policy):
         def step(given, carry):
@@ -360,12 +429,12 @@ def _told_in_windows(ppo: PPO, networks: Networks, rows: Sample):
     def split(x):
         return x.reshape(-1, ppo.window, *x.shape[1:])
 
-    def follow(policy, memory):
-        told = jax.vmap(lambda *given: through(policy, *given)[0])
+    def follow(policy, memory, said=lambda policy: policy):
+        told = jax.vmap(lambda *given: through(policy, *given, said=said)[0])
         told = told(split(rows.obs), split(rows.begins), split(memory)[:, 0])
         return told.reshape(-1, told.shape[-1])
 
-    means = follow(actor.mean, rows.memories[0])
+    means = follow(actor.mean, rows.memories[0], actor.says)
     return means, _value_of(critic, follow(critic.memory, rows.memories[1]), rows.obs)
 
 

@@ -51,9 +51,11 @@ def reach(
     for n in times:
         longer = task.longer(n)
         if longer is None:
+            name = getattr(task, "id", type(task.unwrapped).__name__)
             raise ValueError(
-                f"{type(task.unwrapped).__name__} has no setting that says for how long something "
-                "has to be remembered: a task says so by its method `longer`"
+                f"{name} has no setting that says for how long something has to be remembered; "
+                "T-mazes and sequence tasks have one, and a task of your own by a method "
+                "longer(times)"
             )
         played = evaluate(longer, policies, episodes, key=key).returns[task.reported]
         scores = np.asarray(played, np.float64).reshape(*played.shape[:2], -1).mean(axis=2)

@@ -63,4 +63,7 @@ def of_user(name: str, call: Callable[[], Any] | None = None) -> Any:
         place, what = ending.place(error), f"{type(error).__name__}: {ending.first(error)}"
         if place or not (isinstance(error, TypeError) and isinstance(call, type)):
             fail(f"cannot use {name}: {place or 'it'} raised {what}")
+        if "abstract" in str(error):
+            missing = sorted(getattr(call, "__abstractvars__", call.__abstractmethods__))
+            fail(f"{name} is not complete: define {', '.join(missing)}")
         fail(f"{name} cannot be made without arguments ({error}): give every field a default")

@@ -78,6 +78,7 @@ class Single:
         self.action_size, self.read = _actions(env.action_space)
         self.actions = _described(env.action_space)
         self.discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
+        self.masked = False
         self.said: dict[int, Any] = {}  # by copy: its last observation, as it came
         self._masks: dict[int, np.ndarray] = {}  # by copy: which actions it allows next
         if self.discrete:
@@ -85,6 +86,7 @@ class Single:
             spaces = getattr(env.observation_space, "spaces", {})
             mask = spaces.get("action_mask") if isinstance(spaces, dict) else None
             self._seen = mask is not None and mask.shape == (self.action_size,)
+            self.masked = self._seen or _masks(env)
 
     def _limit(self, env: gymnasium.Env, limit: int | None) -> int:
         """Steps of an episode: the least of the user's limit and of every `TimeLimit` wrapper."""
@@ -146,6 +148,17 @@ class Single:
         return self._choose(actions)
 
 
+def _masks(env: gymnasium.Env) -> bool:
+    """Whether an environment says in `info` which actions it allows: it is asked once. One that
+    cannot be reset fails again, and is heard, when it is played."""
+    try:
+        said = env.reset(seed=0)
+    except Exception:
+        return False
+    info = said[1] if isinstance(said, tuple) and len(said) == 2 else None
+    return isinstance(info, dict) and "action_mask" in info
+
+
 class Team:
     """What all copies of a `ParallelEnv` have in common, taken from the first.
 
@@ -154,7 +167,7 @@ class Team:
     looked up in one step of the first copy (`_Pay`).
     """
 
-    discrete = False
+    discrete = masked = False
     observations: ClassVar[None] = None
 
     @staticmethod

@@ -32,6 +32,7 @@ class AbstractTask(eqx.Module):
         otherwise; the last is what is reported, unless the task does."""
     agents: ClassVar[int | None] = None
     discrete: ClassVar[bool] = False  # the largest of an action's entries is taken
+    masked: ClassVar[bool] = False  # and not every action is allowed at every step
     obs_range: ClassVar[tuple[Any, Any]] = (-math.inf, math.inf)
     """The least and the largest number in an observation."""
 

@@ -88,6 +88,7 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
     obs_dtype = _size("obs_dtype")
     agents = _size("agents")
     discrete = _size("discrete")
+    masked = _size("masked")
 
     def spec(self) -> dict[str, Any]:
         """What a worker must know to open it, as JSON has it."""

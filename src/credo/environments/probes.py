@@ -69,6 +69,48 @@ class Copy(AbstractEnvironment):
         return CopyState(obs, step), TimeStep(obs, {"reward": reward}, jnp.bool_(False), truncated)
 
 
+class Choose(AbstractEnvironment):
+    """Choose what you see: the reward is 1 if the largest entry of the action is where the
+    observation has its 1, of `size` places.
+
+    Each observation is drawn anew. The clock ends the episode (truncated). Best return `max_steps`;
+    by chance one `size`-th of it.
+    """
+
+    signals: ClassVar[tuple[str, ...]] = ("reward",)
+    obs_range: ClassVar[tuple[float, float]] = (0.0, 1.0)
+    discrete: ClassVar[bool] = True
+
+    size: int = eqx.field(static=True, default=3)  # actions, at least 2
+    max_steps: int = eqx.field(static=True, default=10)  # length of every episode, at least 1
+
+    def __check_init__(self):
+        require.at_least("size", self.size, 2)
+        require.at_least("max_steps", self.max_steps, 1)
+
+    @property
+    def obs_size(self) -> int:
+        return self.size
+
+    @property
+    def action_size(self) -> int:
+        return self.size
+
+    def reset(self, *, key: PRNGKeyArray) -> tuple[CopyState, TimeStep]:
+        return self._at(jnp.int32(0), jnp.float32(0.0), key)
+
+    def step(
+        self, state: CopyState, action: Float[Array, " size"], *, key: PRNGKeyArray
+    ) -> tuple[CopyState, TimeStep]:
+        right = jnp.argmax(action) == jnp.argmax(state.obs)
+        return self._at(state.step + 1, right.astype(jnp.float32), key)
+
+    def _at(self, step, reward, key):
+        obs = jax.nn.one_hot(jax.random.randint(key, (), 0, self.size), self.size)
+        truncated = step >= self.max_steps
+        return CopyState(obs, step), TimeStep(obs, {"reward": reward}, jnp.bool_(False), truncated)
+
+
 class LockedState(eqx.Module):
     shown: Float[Array, " size"]  # what is to be copied
     lever: Float[Array, ""]  # its mean over the steps of the first part so far

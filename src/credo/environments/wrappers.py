@@ -220,6 +220,7 @@ class AbstractHostWrapper(AbstractHostEnvironment):
     reported = _of("env", "reported")
     unwrapped = _of("env", "unwrapped")
     discrete = _of("env", "discrete")
+    masked = _of("env", "masked")
     reward_shapes = _of("env", "reward_shapes")
     obs_dtype = _of("env", "obs_dtype")
     obs_range = _of("env", "obs_range")

@@ -40,6 +40,7 @@ class AbstractLearner(eqx.Module):
     reward_scale: eqx.AbstractVar[float | None]  # factor of rewards; None: it follows the buffer
     metrics: eqx.AbstractClassVar[tuple[str, ...]]  # names of what `update` reports
     teams: ClassVar[bool] = False  # whether it learns for all agents of a team
+    discrete: ClassVar[bool] = False  # whether it learns discrete actions, and no others
 
     @abc.abstractmethod
     def init(self, network: AbstractNetwork, *sizes: int, key: PRNGKeyArray) -> PyTree:
@@ -79,9 +80,9 @@ class AbstractLearner(eqx.Module):
 
 
 def window_of(env: AbstractTask) -> int:
-    """Rows of a window on this task: a whole episode, if it has no more than 128 steps, and at
-    least 64. What is asked for at an episode's end was often told at its start."""
-    return max(64, env.max_steps) if env.max_steps <= WHOLE else 64
+    """Rows of a window on this task: a whole episode if none has more than 128 steps, else 64.
+    What is asked for at an episode's end was often told at its start."""
+    return env.max_steps if env.max_steps <= WHOLE else 64
 
 
 def in_windows(
@@ -230,6 +231,44 @@ def act(policy: AbstractPolicy, obs: Float[Array, "batch *agents obs"]) -> Array
         return policy(obs.T, policy.start(key=None))[0].T  # pyright: ignore[reportArgumentType]
     start = policy.start(key=jax.random.key(0))
     return jax.vmap(lambda x: policy(x, start)[0])(obs)
+
+
+def spoken(
+    policy: AbstractPolicy, batch: Batch, later: bool = False
+) -> tuple[Float[Array, "units batch"], Float[Array, "act batch"]]:
+    """What a policy's output layer is given, and says before its activation, in the rows of a batch
+    or after them."""
+    if batch.windows is None:
+        features, said, _ = policy.spoken((batch.next_obs if later else batch.obs).T, ())
+        return features, said
+
+    def step(policy: AbstractPolicy):
+        def parts(obs, carry):
+            features, said, carry = policy.spoken(obs, carry)
+            return (features, said), carry
+
+        return parts
+
+    told = unrolled(policy, seen_in(batch, later), batch.windows, said=step)
+    features, said = (by_row(x, later).T for x in told)
+    return features, said
+
+
+def output_layer(network: AbstractNetwork, policy: AbstractPolicy, obs_size: int, who: str) -> int:
+    """How many numbers a policy's output layer is given. Raises `TypeError` if it has none that is
+    told apart; `who` needs it."""
+
+    def parts():
+        obs, key = jnp.zeros(obs_size), jax.random.key(0)
+        return policy.spoken(obs, policy.start(key=key))
+
+    try:
+        return jax.eval_shape(parts)[0].shape[0]
+    except NotImplementedError:
+        raise TypeError(
+            f"{who} needs what a network's output layer says before its activation, and {network} "
+            "does not tell: give MLP, RNN, GRU, LSTM, MMU, NTM or DNC"
+        ) from None
 
 
 def require_windows(network: AbstractNetwork, sampling: Sampling, capacity: int, *learners) -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .. import require
 from ..networks.base import AbstractNetwork, AbstractPolicy
-from ..networks.history import by_row, moments, remembering, unrolled
+from ..networks.history import remembering
 from ..networks.mlp import (
     MLP,
     AbstractCritic,
@@ -37,7 +37,9 @@ from .base import (
     bellman,
     descend,
     mean,
+    output_layer,
     polyak,
+    spoken,
 )
 
 HYBRID_NETWORK = MLP(hidden=(256, 256), activation="tanh", initializer="uniform")
@@ -67,14 +69,7 @@ class StochasticActor(eqx.Module):
     ) -> tuple[Float[Array, "act batch"], Float[Array, " batch"]]:
         """Actions in the rows of a batch, or in what follows them, and their log probability
         density."""
-        if batch.windows is None:
-            obs = batch.next_obs if later else batch.obs
-            features, mean, _ = self.mean.spoken(obs.T, ())
-        else:
-            seen = moments(batch, later)
-            told = unrolled(self.mean, seen, batch.windows, said=_spoken)
-            features, mean = (by_row(x, later).T for x in told)
-        return self.drawn(features, mean, key=key)
+        return self.drawn(*spoken(self.mean, batch, later), key=key)
 
     def drawn(
         self, features: Float[Array, "units *batch"], output: Float[Array, "act *batch"], *, key
@@ -88,16 +83,6 @@ class StochasticActor(eqx.Module):
         log_p = -0.5 * jnp.square(noise) - log_std - 0.5 * jnp.log(2.0 * jnp.pi)
         log_p = log_p - 2.0 * (jnp.log(2.0) - u - jax.nn.softplus(-2.0 * u))
         return jnp.tanh(u), jnp.sum(log_p, axis=0)
-
-
-def _spoken(policy: AbstractPolicy):
-    """The output layer's input and output, and the next carry."""
-
-    def step(obs, carry):
-        features, output, carry = policy.spoken(obs, carry)
-        return (features, output), carry
-
-    return step
 
 
 class Sampler(AbstractPolicy):
@@ -169,7 +154,8 @@ class SAC(AbstractLearner):
         obs_size, action_size = sizes
         actor_key, head_key, critic_key = jax.random.split(key, 3)
         mean = network.init(obs_size, action_size, key=actor_key)
-        units, steepness = _output_layer(network, mean, obs_size)
+        steepness = _steepness(network)
+        units = output_layer(network, mean, obs_size, "SAC")
         initializer = getattr(network, "initializer", "uniform")
         head = draw_layers((units, action_size), initializer, key=head_key)
         actor = StochasticActor(mean, head, steepness)
@@ -267,23 +253,14 @@ def soft_actor_loss(
     return mean(alpha * log_p - q, batch.active), log_p
 
 
-def _output_layer(network: AbstractNetwork, policy: AbstractPolicy, obs_size: int):
-    """How many numbers the output layer is given, and the slope of its activation beside tanh's.
-    Raises `TypeError` if the network does not tell."""
-
-    def parts():
-        obs, key = jnp.zeros(obs_size), jax.random.key(0)
-        return policy.spoken(obs, policy.start(key=key))
-
+def _steepness(network: AbstractNetwork) -> float:
+    """The slope of a network's output activation at 0, beside tanh's. Raises `TypeError` if it is
+    neither tanh nor a sigmoid."""
     slope = {"tanh": 1.0, "sigmoid": 0.5}.get(getattr(network, "output_activation", ""))
-    try:
-        features, _, _ = jax.eval_shape(parts)
-    except NotImplementedError:
-        slope = None
     if slope is None:
         raise TypeError(
             f"SAC draws actions around what a network's output layer says, and {network} has none "
             "that ends in tanh or sigmoid: give MLP, RNN, GRU, LSTM, MMU, NTM or DNC, or train it "
             "by TD3"
         )
-    return features.shape[0], slope
+    return slope

@@ -12,7 +12,7 @@ matrix products.
 import abc
 import itertools
 import math
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -26,6 +26,15 @@ ACTIVATIONS = {
     "identity": lambda x: x,
     "relu": jax.nn.relu,
     "elu": jax.nn.elu,
+}
+OutputActivation = Literal["sigmoid", "tanh", "relative"]
+"""What turns an output into an action in [-1, 1]. `relative`, for discrete actions: how far each
+output is below the largest, tanh(u - max u). The largest is found again, whatever their size, where
+other activations saturate at numbers above 9, and all are alike."""
+OUTPUTS = {
+    "sigmoid": ACTIVATIONS["sigmoid"],
+    "tanh": ACTIVATIONS["tanh"],
+    "relative": lambda u: jnp.tanh(u - jnp.max(u, axis=0, keepdims=True)),
 }
 INITIALIZERS = {
     "normal": lambda fan_in: 1.0,  # the author's for sequences
@@ -138,6 +147,11 @@ def features_first(x: Float[Array, "batch *agents size"]) -> Float[Array, "size 
     return jnp.moveaxis(x, -1, 0)
 
 
+def acted(u: Float[Array, "act *batch"], activation: str) -> Float[Array, "act *batch"]:
+    """What an output layer says before its `activation`, as an action in [-1, 1]."""
+    return 2.0 * OUTPUTS["sigmoid"](u) - 1.0 if activation == "sigmoid" else OUTPUTS[activation](u)
+
+
 def to_action(output: Float[Array, "act *batch"], activation: str) -> Float[Array, "act *batch"]:
-    """An output in [0, 1] (sigmoid) or [-1, 1] (tanh) as an action in [-1, 1]."""
+    """An output in [0, 1] (sigmoid) or [-1, 1] (others) as an action in [-1, 1]."""
     return 2.0 * output - 1.0 if activation == "sigmoid" else output

@@ -23,7 +23,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .. import require
-from .base import ACTIVATIONS, INITIALIZERS, AbstractNetwork, AbstractPolicy, draw, to_action
+from .base import (
+    ACTIVATIONS,
+    INITIALIZERS,
+    AbstractNetwork,
+    AbstractPolicy,
+    OutputActivation,
+    acted,
+    draw,
+)
 from .external_memory import Weights, by_content, control, controller_shapes
 
 
@@ -36,7 +44,7 @@ class DNC(AbstractNetwork):
     rows: int = eqx.field(static=True, default=16)  # memory locations N, at least 1
     width: int = eqx.field(static=True, default=16)  # numbers in a memory location W, at least 1
     read_heads: int = eqx.field(static=True, default=4)  # heads that read, R, at least 1
-    output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
+    output_activation: OutputActivation = eqx.field(static=True, default="sigmoid")
     """Activation of the output layer."""
     initializer: str = eqx.field(static=True, default="normal")
     """Fresh weights: normal, fan_in or kaiming."""
@@ -85,9 +93,8 @@ class DNCPolicy(AbstractPolicy):
         return state, read, at_read, rows, rows, rows, links, zeros((c.rows, c.width))
 
     def __call__(self, obs, carry):
-        _, y, carry = self.spoken(obs, carry)
-        y = ACTIVATIONS[self.config.output_activation](y)
-        return to_action(y, self.config.output_activation), carry
+        _, u, carry = self.spoken(obs, carry)
+        return acted(u, self.config.output_activation), carry
 
     def spoken(self, obs, carry):
         state, read, at_read, at_write, used, last, links, memory = carry

@@ -78,3 +78,50 @@ class Explorer(AbstractPolicy):
         drawn = jax.random.uniform(random_key, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.clip(action + noise, -1.0, 1.0) if self.clipped else action + noise
         return jnp.where(self.random, drawn, action), (carry, before, key)
+
+
+class EpsilonGreedy(AbstractPolicy):
+    """A policy of discrete actions, of which every action has an equal chance in a share ε of the
+    steps (Mnih et al. 2015)."""
+
+    policy: AbstractPolicy
+    epsilon: Float[Array, ""]  # ε: that share, in [0, 1]; all of it while `random`
+    random: Bool[Array, ""]
+    features_first: ClassVar[bool] = False
+
+    def start(self, *, key: PRNGKeyArray) -> PyTree:
+        policy_key, drawn_key = jax.random.split(key)
+        return self.policy.start(key=policy_key), drawn_key
+
+    def remembered(self, carry):
+        return self.policy.remembered(carry[0])
+
+    def __call__(self, obs, carry):
+        carry, key = carry
+        key, when_key, which_key = jax.random.split(key, 3)
+        action, carry = self.policy(obs, carry)
+        drawn = jax.random.uniform(which_key, action.shape, minval=-1.0, maxval=1.0)
+        strays = self.random | (jax.random.uniform(when_key) < self.epsilon)
+        return jnp.where(strays, drawn, action), (carry, key)
+
+
+class Categorical(AbstractPolicy):
+    """Discrete actions drawn with the probabilities softmax(u) of what a policy says before its
+    output activation: 1 for the one that is drawn, -1 for the others."""
+
+    policy: AbstractPolicy
+    features_first: ClassVar[bool] = False
+
+    def start(self, *, key: PRNGKeyArray) -> PyTree:
+        policy_key, drawn_key = jax.random.split(key)
+        return self.policy.start(key=policy_key), drawn_key
+
+    def remembered(self, carry):
+        return self.policy.remembered(carry[0])
+
+    def __call__(self, obs, carry):
+        carry, key = carry
+        key, drawn_key = jax.random.split(key)
+        _, u, carry = self.policy.spoken(obs, carry)
+        chosen = jax.random.categorical(drawn_key, u)
+        return jnp.where(jnp.arange(len(u)) == chosen, 1.0, -1.0), (carry, key)

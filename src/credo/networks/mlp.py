@@ -17,10 +17,11 @@ from .base import (
     INITIALIZERS,
     AbstractNetwork,
     AbstractPolicy,
+    OutputActivation,
+    acted,
     draw,
     features_first,
     matvec,
-    to_action,
 )
 from .values import AbstractValues, Mean
 
@@ -35,7 +36,7 @@ class MLP(AbstractNetwork):
     activation: str = eqx.field(static=True, default="tanh")  # activation of the hidden layers
     normalization: Literal["none", "before", "after"] = eqx.field(static=True, default="none")
     """LayerNorm of the hidden layers, before their activation or after it."""
-    output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="tanh")
+    output_activation: OutputActivation = eqx.field(static=True, default="tanh")
     """Activation of the output layer."""
     output_scale: float = eqx.field(static=True, default=1.0)
     """Scale of the fresh output layer's weights, above 0."""
@@ -85,8 +86,7 @@ class MLPPolicy(AbstractPolicy):
 
     def action(self, output: Float[Array, "act *batch"]) -> Float[Array, "act *batch"]:
         """The output, before its activation, as an action in [-1, 1]."""
-        kind = self.config.output_activation
-        return to_action(ACTIVATIONS[kind](output), kind)
+        return acted(output, self.config.output_activation)
 
 
 class AbstractCritic(eqx.Module):

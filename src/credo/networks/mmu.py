@@ -26,8 +26,10 @@ from .. import require
 from .base import (
     ACTIVATIONS,
     INITIALIZERS,
+    OUTPUTS,
     AbstractNetwork,
     AbstractPolicy,
+    OutputActivation,
     draw,
     matvec,
     to_action,
@@ -53,7 +55,7 @@ class MMU(AbstractNetwork):
     """Activation θ of equation 3.2: what is read."""
     encoder_activation: str = eqx.field(static=True, default="tanh")
     """Activation θ of equation 3.4: what is written."""
-    output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
+    output_activation: OutputActivation = eqx.field(static=True, default="sigmoid")
     """Activation of the output layer."""
     start_memory: Literal["learned", "zero"] = eqx.field(static=True, default="learned")
     """Memory at the first step: learned, or zeros."""
@@ -183,14 +185,9 @@ class MMUPolicy(AbstractPolicy):
     def spoken(self, obs, carry):
         x, (y, m), c = obs, carry, self.config
         σ = ACTIVATIONS["sigmoid"]
-        φ, θ_d, θ_f, φ_y = (
+        φ, θ_d, θ_f = (
             ACTIVATIONS[name]
-            for name in (
-                c.block_activation,
-                c.decoder_activation,
-                c.encoder_activation,
-                c.output_activation,
-            )
+            for name in (c.block_activation, c.decoder_activation, c.encoder_activation)
         )
         at_i, at_p, at_r, at_w = self._inputs(x, y, m)
         i, p, r, w = σ(at_i), φ(at_p), σ(at_r), σ(at_w)  # (3.1), gates
@@ -202,7 +199,7 @@ class MMUPolicy(AbstractPolicy):
         else:
             m = (1.0 - c.alpha) * (m + w * f) + c.alpha * (w * f + (1.0 - w) * m)  # (3.4)
         u = matvec(self.Z_y, h) + self.b_y
-        return h, u, (φ_y(u), m)  # (3.5)
+        return h, u, (OUTPUTS[c.output_activation](u), m)  # (3.5)
 
     def _inputs(self, x, y, m):
         """What the input gate, the block input, the read gate and the write gate are fed."""

@@ -24,7 +24,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .. import require
-from .base import ACTIVATIONS, INITIALIZERS, AbstractNetwork, AbstractPolicy, draw, to_action
+from .base import (
+    ACTIVATIONS,
+    INITIALIZERS,
+    AbstractNetwork,
+    AbstractPolicy,
+    OutputActivation,
+    acted,
+    draw,
+)
 from .external_memory import Weights, by_content, control, controller_shapes
 
 LEAST = 1e-12  # added to a weight before its logarithm
@@ -49,7 +57,7 @@ class NTM(AbstractNetwork):
     start_memory: Literal["learned", "constant"] = eqx.field(static=True, default="learned")
     """Memory at the first step: learned, or 10⁻⁶ everywhere (Collier & Beel 2018). In that case
     fresh heads start at the first row: equal rows that are looked at equally stay equal."""
-    output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
+    output_activation: OutputActivation = eqx.field(static=True, default="sigmoid")
     """Activation of the output layer."""
     initializer: str = eqx.field(static=True, default="normal")
     """Fresh weights: normal, fan_in or kaiming."""
@@ -127,9 +135,8 @@ class NTMPolicy(AbstractPolicy):
         return state, w["r_0"], *at, memory
 
     def __call__(self, obs, carry):
-        _, y, carry = self.spoken(obs, carry)
-        y = ACTIVATIONS[self.config.output_activation](y)
-        return to_action(y, self.config.output_activation), carry
+        _, u, carry = self.spoken(obs, carry)
+        return acted(u, self.config.output_activation), carry
 
     def spoken(self, obs, carry):
         (state, read, at_read, at_write, memory), w = carry, self.weights

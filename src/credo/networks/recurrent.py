@@ -18,9 +18,10 @@ from .base import (
     INITIALIZERS,
     AbstractNetwork,
     AbstractPolicy,
+    OutputActivation,
+    acted,
     draw,
     matvec,
-    to_action,
 )
 
 GATES = {"rnn": ("h",), "gru": ("z", "r", "h"), "lstm": ("i", "f", "o", "c")}
@@ -32,7 +33,7 @@ class Recurrent(AbstractNetwork):
     cell: Literal["rnn", "gru", "lstm"] = eqx.field(static=True, default="lstm")
     """Rnn (Elman), gru, or lstm."""
     hidden: int = eqx.field(static=True, default=5)  # units (of an LSTM cells), at least 1
-    output_activation: Literal["sigmoid", "tanh"] = eqx.field(static=True, default="sigmoid")
+    output_activation: OutputActivation = eqx.field(static=True, default="sigmoid")
     """Activation of the output layer."""
     initializer: str = eqx.field(static=True, default="normal")
     """Fresh weights: normal, fan_in or kaiming."""
@@ -77,9 +78,8 @@ class RecurrentPolicy(AbstractPolicy):
         return (zeros, zeros) if self.config.cell == "lstm" else zeros
 
     def __call__(self, obs, carry):
-        _, y, carry = self.spoken(obs, carry)
-        y = ACTIVATIONS[self.config.output_activation](y)
-        return to_action(y, self.config.output_activation), carry
+        _, u, carry = self.spoken(obs, carry)
+        return acted(u, self.config.output_activation), carry
 
     def spoken(self, obs, carry):
         h, carry = getattr(self, f"_{self.config.cell}")(obs, carry)

@@ -96,7 +96,11 @@ def _once(texts: Iterable[str]) -> list[str]:
 
 
 def _task(tree: Tree) -> str:
-    """The id of a task of Gymnasium or PettingZoo; of ours its class and fields."""
+    """The id of a task of Gymnasium or PettingZoo; of ours its class and fields; of a wrapper that
+    of the task inside, and what the wrapper is."""
+    if isinstance(inner := tree.get("env"), Mapping):
+        around = {name: value for name, value in tree.items() if name != "env"}
+        return f"{_task(inner)} in {config.brief(around)}"
     return str(tree["id"]) if "id" in tree else config.brief(dict(tree))
 
 

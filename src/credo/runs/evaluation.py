@@ -93,10 +93,12 @@ def horizon(
     `episodes`: of each; None: 100. `seed` as in `played`.
     """
     episodes = episodes or 100
-    yield f"{run.path}: {task.reported} in {episodes} fresh episodes of each"
-    policies = tree.single(run.champion)
-    for n in times or TIMES:
+    policies, title = tree.single(run.champion), f"{run.path}: {task.reported} in {episodes} fresh"
+    for n in sorted(set(times)) or TIMES:
         (found,) = probes.reach(task, policies, (n,), episodes, key=_key(seed))
+        if title:
+            yield f"{title} episodes of each"
+            title = ""
         score = _score(found.scores[0])
         error = "" if np.isnan(score.error) else f" ± {score.error:.2g}"
         yield f"  {f'× {n:,}':<10} {f'{score.mean:.4g}{error}':<18} {found.changed}"
