@@ -33,7 +33,7 @@ from ..types import Metrics, Transition
 from .fitness import objective, retested
 
 NETWORK = MLP(hidden=(64, 64), activation="tanh", initializer="fan_in", output_scale=0.01)
-METRICS = ("policy_loss", "critic_loss", "clipped", "entropy")
+METRICS = ("policy_loss", "critic_loss", "clipped")
 
 
 class Actor(eqx.Module):
@@ -384,7 +384,6 @@ def surrogate(ppo: PPO, networks: Networks, rows: Sample) -> tuple[Float[Array, 
     clipped = mean((ratio != bounded).astype(jnp.float32), rows.counts)
     entropy = mean(actor.entropy(means), rows.counts)
     metrics = {"policy_loss": policy_loss, "critic_loss": critic_loss, "clipped": clipped}
-    metrics |= {"entropy": entropy}
     loss = policy_loss + ppo.value_weight * critic_loss - ppo.entropy_weight * entropy
     return loss, metrics
 
