@@ -4,7 +4,7 @@ import contextlib
 import copy
 import json
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -68,7 +68,7 @@ class Run:
         columns, settings = self.metrics, self.config["algorithm"]
         row = {name: column[-1] for name, column in columns.items()}
         best, value = best_of(row)
-        when = " at the last test" * (settings.get("test_every", 1) > 1)  # not of today's champion
+        when = _last_test(columns, settings)
         episodes = settings.get("test_episodes")
         when += f" on {episodes} fresh episodes" if episodes is not None else ""
         return (
@@ -183,3 +183,21 @@ def _json(text: str | None) -> Any:
         return json.loads(text or "null")
     except ValueError:
         return None
+
+
+def _last_test(columns: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+    """When the score at hand was found, where that was not in the last generation: the champion may
+    have learned since. Populations are tested every so many generations, learners alone frames."""
+    every = settings.get("test_every", 1)
+    if every <= 1:
+        return ""
+    if "population_size" in settings:
+        due = (columns["generation"] - 1) % every == 0
+    else:
+        due = np.diff(columns["frames"] // every, prepend=-1) > 0
+    last = int(np.flatnonzero(due)[-1]) if due.any() else 0
+    if last == len(due) - 1:
+        return ""
+    if "frames" in columns:
+        return f" at the last test, after {int(columns['frames'][last]):,} frames,"
+    return f" at the last test, after generation {int(columns['generation'][last])},"
