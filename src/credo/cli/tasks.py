@@ -57,6 +57,8 @@ def _named(name: str, kwargs: dict[str, Any]) -> Any:
     or an id of Gymnasium."""
     if name in TASKS:
         return load(TASKS[name]["path"])()
+    if name.startswith("gymnax:"):
+        return _of_gymnax(name)
     if re.fullmatch(r"\w+(\.\w+)*:\w+", name):
         return _own(name, kwargs)
     if re.fullmatch(r"\w+(\.\w+)+", name):
@@ -68,6 +70,18 @@ def _named(name: str, kwargs: dict[str, Any]) -> Any:
     if match := re.fullmatch(r"(?:\./)?(\w+)\.py:(\w+)", name):  # a file in place of its module
         fail(f"{name!r} names a file: name its module, {match[1]}:{match[2]}")
     return _registered(name)
+
+
+def _of_gymnax(name: str) -> Any:
+    """gymnax:CartPole-v1."""
+    try:
+        made = load("environments.gymnax:Gymnax")
+    except ModuleNotFoundError as error:
+        fail(str(error))
+    try:
+        return made(id=name.partition(":")[2])
+    except ValueError as error:
+        fail(str(error))
 
 
 def _registered(name: str) -> Any:

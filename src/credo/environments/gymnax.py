@@ -1,0 +1,139 @@
+"""Tasks of gymnax (Lange 2022), in JAX.
+
+    task = Gymnax("CartPole-v1")  # credo train ppo gymnax:CartPole-v1
+
+Needs gymnax 1.0 or later. It is compiled with its policies into one program, like a task of our
+own. Its automatic resets are not used: an episode ends where it ends, and `terminated` and
+`truncated` are told apart.
+"""
+
+import functools
+import importlib.util
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from .. import require
+from ..types import TimeStep
+from .base import AbstractEnvironment
+
+if importlib.util.find_spec("gymnax") is None:
+    raise ModuleNotFoundError("tasks of gymnax need it: `pip install gymnax`")
+
+import gymnax
+from gymnax.environments import spaces
+
+
+@functools.cache
+def _made(id: str, settings: tuple[tuple[str, Any], ...]) -> tuple[Any, Any]:
+    """The environment, and its parameters with these settings."""
+    with _permissive():
+        env, params = gymnax.make(id)
+    known = [name for name in vars(params) if not name.startswith("_")]
+    for name, _ in settings:
+        require.choice("setting", name, known)
+    return env, params.replace(**dict(settings))
+
+
+def _permissive():
+    """Others' code relies on dtypes and ranks that JAX may be told to refuse."""
+    return jax.numpy_dtype_promotion("standard")
+
+
+def _pairs(settings: Any) -> tuple[tuple[str, Any], ...]:
+    return tuple(sorted(dict(settings).items()))
+
+
+class Gymnax(AbstractEnvironment):
+    """An environment of gymnax with Box or Discrete actions.
+
+    Observations are flattened, a Discrete one is one-hot. Of a Box action -1 is its low and 1 its
+    high; of Discrete actions the largest number is taken. The one signal is `reward`. The clock is
+    the environment's own, `max_steps_in_episode`.
+    """
+
+    signals: ClassVar[tuple[str, ...]] = ("reward",)
+
+    id: str = eqx.field(static=True)  # as in gymnax.registered_envs, such as CartPole-v1
+    kwargs: tuple[tuple[str, Any], ...] = eqx.field(static=True, converter=_pairs, default=())
+    """Parameters of the environment by name, such as max_steps_in_episode; others stay."""
+
+    def __check_init__(self):
+        known = gymnax.registered_envs
+        require.choice("id", self.id, known)
+        action = self._env.action_space(self._params)
+        if not isinstance(action, spaces.Box | spaces.Discrete):
+            raise ValueError(
+                f"{self.id} has actions of {type(action).__name__}: a Box or a Discrete is needed"
+            )
+
+    @property
+    def _env(self) -> Any:
+        return _made(self.id, self.kwargs)[0]
+
+    @property
+    def _params(self) -> Any:
+        return _made(self.id, self.kwargs)[1]
+
+    @property
+    def obs_size(self) -> int:
+        return _size(self._env.observation_space(self._params))
+
+    @property
+    def action_size(self) -> int:
+        return _size(self._env.action_space(self._params))
+
+    @property
+    def discrete(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return isinstance(self._env.action_space(self._params), spaces.Discrete)
+
+    @property
+    def max_steps(self) -> int:
+        return int(self._params.max_steps_in_episode)
+
+    def reset(self, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
+        with _permissive():
+            obs, state = self._env.reset_env(key, self._params)
+        state, no = jax.tree.map(jnp.asarray, state), jnp.bool_(False)  # its clock is a plain 0
+        return state, TimeStep(self._flat(obs), {"reward": jnp.float32(0.0)}, no, no)
+
+    def step(
+        self, state: PyTree, action: Float[Array, " act"], *, key: PRNGKeyArray
+    ) -> tuple[PyTree, TimeStep]:
+        with _permissive():
+            obs, state, reward, over, _ = self._env.step_env(
+                key, state, self._own(action), self._params
+            )
+            late = jnp.asarray(self._env.is_truncated(state, self._params), bool)
+        over = jnp.asarray(over, bool)
+        rewards = {"reward": jnp.asarray(reward, jnp.float32).reshape(())}
+        return state, TimeStep(self._flat(obs), rewards, over, late & ~over)
+
+    def _own(self, action: Float[Array, " act"]) -> Any:
+        """An action as the environment takes it."""
+        space = self._env.action_space(self._params)
+        if self.discrete:
+            return jnp.argmax(action).astype(space.dtype)
+        low, high = (np.broadcast_to(x, space.shape) for x in (space.low, space.high))
+        return low + (action.reshape(space.shape) + 1.0) / 2.0 * (high - low)
+
+    def _flat(self, obs: Any) -> Float[Array, " obs"]:
+        """An observation as numbers."""
+        space = self._env.observation_space(self._params)
+        if isinstance(space, spaces.Discrete):
+            return jax.nn.one_hot(obs, space.n, dtype=jnp.float32)
+        parts = [jnp.asarray(x, jnp.float32).reshape(-1) for x in jax.tree.leaves(obs)]
+        return jnp.concatenate(parts)
+
+
+def _size(space: Any) -> int:
+    """Numbers in a flat observation or action."""
+    if isinstance(space, spaces.Discrete):
+        return int(space.n)
+    if isinstance(space, spaces.Dict):
+        return sum(_size(part) for part in space.spaces.values())
+    return int(np.prod(space.shape))
