@@ -65,6 +65,11 @@ def fits(env: Any, network: Any, *learners: Any) -> None:
     if unfit:
         has, instead = f"{env.agents} agents", "Teams learn by TD3 (credo train merl, matd3)"
         raise ValueError(_cannot_learn(env, has, instead, unfit))
+    if getattr(network, "output_activation", None) == "relative" and not env.discrete:
+        raise ValueError(
+            f"output_activation is 'relative' and {getattr(env, 'id', type(env).__name__)} has Box "
+            "actions: that is for a choice, of which the largest output is always 0; give 'tanh'"
+        )
     if network.team != team:
         raise ValueError(_other_team(env, network))
     if not team and any(getattr(learner, "together", False) for learner in learners):

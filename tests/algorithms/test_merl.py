@@ -533,11 +533,11 @@ def test_without_a_local_reward_learners_maximise_that_of_the_team_and_say_so():
     """Flags can then name another: before, the preset was refused ahead of them."""
     fleet = ServerFleet(servers=2, devices=4, nefarious=(1, 2))
     for preset in (MERL.merl, MERL.hybrid):
-        with pytest.warns(UserWarning, match="ServerFleet has no reward named local: .* net, as"):
+        with pytest.warns(UserWarning, match="ServerFleet has no reward named local"):
             made = preset(fleet)
         assert {learner.signal for learner in made.learners} == {None}
     maze = ExtendedTMaze(robots=2, partner=None, rewards=("score", "difference"))
-    with pytest.warns(UserWarning, match="to name another of difference"):
+    with pytest.warns(UserWarning, match="signal names another of score, difference"):
         MERL.merl(maze)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -12,14 +12,19 @@ from walk import HostWalk, Walk
 
 from credo import rollout, tree
 from credo.algorithms.erl import ERL
+from credo.algorithms.neuroevolution import Neuroevolution
 from credo.algorithms.off_policy import OffPolicy
 from credo.algorithms.ppo import PPO
 from credo.compilation import jit
 from credo.environments.gymnasium import Gymnasium
+from credo.environments.hidden import hidden
+from credo.environments.last_step import with_last_step
 from credo.environments.probes import Choose, Copy, Meet
-from credo.environments.wrappers import delayed
+from credo.environments.wrappers import NoisyObservations, delayed
 from credo.learners import td3 as learners
+from credo.learners.coach import Coached
 from credo.learners.dqn import DQN
+from credo.learners.fitness_critic import Criticised, FitnessCritic
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3, ddpg
 from credo.networks.exploration import OrnsteinUhlenbeck
@@ -175,10 +180,14 @@ def test_a_policy_that_goes_on_is_tested_at_once():
 
 
 CART = Gymnasium("CartPole-v1", in_process=True)
+HIDDEN = hidden(NoisyObservations(Choose(), 0.1), "0")
 
 
 @pytest.mark.parametrize("build", [OffPolicy, ERL])
-@pytest.mark.parametrize("env", [CART, delayed(CART), Choose()])
+@pytest.mark.parametrize(
+    "env",
+    [CART, delayed(CART), Choose(), delayed(Choose()), with_last_step(Choose()), HIDDEN],
+)
 def test_tasks_without_a_gradient_are_refused(build, env):
     told = (
         r"has Discrete actions: (TD3|DDPG) cannot learn that\. Give DQN .* evolve without a learner"
@@ -196,6 +205,40 @@ def test_dqn_is_refused_where_there_is_nothing_to_choose():
 def test_outputs_that_saturate_are_refused_where_they_choose(build):
     with pytest.raises(ValueError, match="give MLP output_activation='relative'"):
         build(Choose(), MLP((4,))).init(key=jax.random.key(0))
+
+
+def test_outputs_of_a_choice_are_refused_where_actions_are_numbers():
+    relative = MLP((4,), output_activation="relative")
+    for build in (OffPolicy.td3, PPO.ppo, ERL.ea, Neuroevolution):
+        with pytest.raises(ValueError, match="'relative' and Copy has Box actions"):
+            build(Copy(), relative)
+
+
+def test_what_wraps_a_learner_learns_what_it_does():
+    learner = Criticised(DQN(), FitnessCritic())
+    with pytest.raises(ValueError, match="Copy has Box actions: Criticised cannot learn that"):
+        OffPolicy(Copy(), MLP((4,)), learner).init(key=jax.random.key(0))
+    assert not learner.teams
+    assert Criticised().teams
+
+
+def test_there_is_no_gradient_for_a_coach_through_a_choice():
+    with pytest.raises(ValueError, match="none through the discrete actions of DQN: give no coach"):
+        ERL.erl(Choose(), coach=Coached())
+
+
+@pytest.mark.parametrize("env", [Choose(), CART])
+def test_the_last_action_is_told_as_a_choice(env):
+    """Whatever numbers chose it: else a policy would see in tests what it never saw while it
+    learned."""
+    network = MLP((4,), output_activation="relative")
+    for build in (OffPolicy.dqn, PPO.ppo):
+        algorithm = build(with_last_step(env), network, test_episodes=2, test_every=1)
+        _, state = run(algorithm, 2, play=eager if env is CART else generation)
+        told = np.asarray(state.replay.data.next_obs)[: int(state.replay.size)]
+        told = told[:, env.obs_size : env.obs_size + env.action_size]
+        assert set(np.unique(told).tolist()) == {-1.0, 1.0}
+        assert ((told > 0).sum(axis=1) == 1).all()
 
 
 CHOOSING = {

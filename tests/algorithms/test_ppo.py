@@ -137,9 +137,20 @@ def test_windows_of_short_episodes_are_learned_from(length):
         )
 
 
-def test_a_minibatch_that_is_never_full_is_refused():
-    with pytest.raises(ValueError, match="batch_size is 64 and horizon is 32: a round of frames"):
-        PPO(Copy(), batch_size=64, horizon=32)
+def test_a_round_that_fills_no_minibatch_is_learned_from_all_the_same():
+    """It once had no update, and did not say so. Rows that are no frames change nothing."""
+    ppo = PPO(Copy(max_steps=1), copies=8, horizon=8, batch_size=64, epochs=1, network=MLP((4,)))
+    state = jit(ppo.init)(key=jax.random.key(0))
+    after, metrics = jit(ppo.generation)(state, key=jax.random.key(1))
+    assert int(metrics["frames"]) == 8
+    assert float(metrics["critic_loss"]) > 0
+    junk = jax.tree.map(
+        lambda x: x.at[8:].set(True if x.dtype == bool else 7) if x.ndim else x, after.replay
+    )
+    key, given = jax.random.key(2), (state.actor, state.critic)
+    found = [improve(ppo, given, state.optimizer, x, key=key)[0] for x in (after.replay, junk)]
+    for a, b in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
 
 
 def test_the_entropy_of_a_gaussian_and_of_a_choice():

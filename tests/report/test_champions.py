@@ -2,6 +2,7 @@
 
 import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -172,10 +173,19 @@ class TestProbes:
         without[[4, 9]] = 0.25, 0.5
         worth = probes.Worth(1.0, without, np.zeros(20), 0.0)
         monkeypatch.setattr(champions, "worth_of_cells", lambda *_, **__: worth)
-        (table,) = champions.cells(PassiveTMaze(3), None)
+        policy = MMU(hidden=20).init(2, 2, key=jax.random.key(0))
+        (table,) = champions.cells(PassiveTMaze(3), policy)
         assert [row[0] for row in table.rows[:2]] == ["5", "10"]
         assert len(table.rows) == champions.ROWS
         assert f"The {champions.ROWS} most needed of 20 cells" in table.caption
+
+    def test_what_would_take_long_is_left_out(self, monkeypatch):
+        policy = MMU(hidden=3).init(2, 2, key=jax.random.key(0))
+        monkeypatch.setattr(champions, "MOST", 20)
+        (curve,) = champions.horizon(PassiveTMaze(3), policy)
+        assert np.asarray(curve.curves[0].x).tolist() == [1, 2, 5]
+        monkeypatch.setattr(champions, "STEPS", 8 * champions.PLAYED * 4 - 1)
+        assert not list(champions.cells(PassiveTMaze(3), policy))
 
     def test_no_curve_where_the_task_has_no_setting_for_it(self, tmp_path):
         run = evolved(MMU(hidden=2), tmp_path, Remember(delay=1))

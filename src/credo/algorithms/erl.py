@@ -180,8 +180,8 @@ class ERL(Hybrid):
 
     @classmethod
     def cerl(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """Chapter 6: TD3 at four discounts, ten workers, UCB. What the text leaves open is the
-        author's: ω = 5, a fifth are elites."""
+        """Chapter 6: TD3 (of discrete actions DQN) at four discounts, ten workers, UCB. What the
+        text leaves open is the author's: ω = 5, a fifth are elites."""
         kind = DQN if env.discrete else TD3
         learners = tuple(kind(gamma=γ) for γ in (0.9, 0.99, 0.997, 0.9995))
         settings = {"learners": learners, "workers": 10, "manager": UCB(), "elite_fraction": 0.2}

@@ -62,10 +62,10 @@ def _local(env: Environment) -> TD3:
     """`LOCAL`, or on a task without such a reward its twin for the task's first one."""
     if "local" in env.signals:
         return LOCAL
-    first, *others = env.signals
-    told = f"; give learners.0.signal to name another of {', '.join(others)}" if others else ""
+    several = len(env.signals) > 1
+    told = f"; learners.0.signal names another of {', '.join(env.signals)}" if several else ""
     warnings.warn(
-        f"{type(env.unwrapped).__name__} has no reward named local: learners maximise {first}, as "
+        f"{type(env.unwrapped).__name__} has no reward named local: learners maximise what "
         f"evolution does{told}",
         stacklevel=2,
     )

@@ -19,7 +19,7 @@ from ..compilation import float32
 from ..learners.base import AbstractLearner, in_windows, learn, require_windows
 from ..learners.credit import AbstractRedistribution
 from ..learners.decomposed import Decomposed
-from ..learners.dqn import DQN, DQN_NETWORK
+from ..learners.dqn import DQN, DQN_NETWORK, choosing
 from ..learners.sac import HYBRID_NETWORK, SAC, modern
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, TEAM, ddpg, maddpg, matd3
 from ..networks.base import AbstractNetwork, AbstractPolicy
@@ -100,7 +100,7 @@ class OffPolicy(eqx.Module):
     def dqn(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """Discrete actions: double Q-learning, with an update per frame."""
         settings = in_windows(env, network, {"learner": DQN(), "start_frames": 1_000})
-        return cls(env, network or DQN_NETWORK, **settings | overrides)
+        return cls(env, network or choosing(env, DQN_NETWORK), **settings | overrides)
 
     @classmethod
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:

@@ -171,11 +171,6 @@ class PPO(eqx.Module):
                 f"batch_size is {self.batch_size} and window is {self.window}: a network with "
                 "memory learns from whole windows; give a larger batch_size, or a smaller window"
             )
-        if self.batch_size > self.horizon and not self.network.remembers:
-            raise ValueError(
-                f"batch_size is {self.batch_size} and horizon is {self.horizon}: a round of frames "
-                "would not fill one minibatch; give a smaller batch_size, or a larger horizon"
-            )
         for name in ("gamma", "gae"):
             require.within(name, getattr(self, name), 0, 1)
         for name in (
@@ -293,8 +288,7 @@ def improve(
     pieces = -(-replay.capacity // together)
     some = min(max(ppo.batch_size // together, 1), pieces)
     ready = -(-replay.size // together)
-    # Windows say which of their rows are frames, so that a minibatch need not be full.
-    batches = jnp.maximum(ready // some, 1) if together > 1 else ready // some
+    batches = jnp.maximum(ready // some, 1)  # of few frames one, which is not full
     weights, static = eqx.partition(networks, eqx.is_inexact_array)
 
     def epoch(k, loop):
@@ -329,11 +323,11 @@ def prepare(ppo: PPO, networks: Networks, replay: Replay, moments: Moments | Non
     reward = rows.rewards[objective(ppo.env, ppo.signal)]
     obs, next_obs = seen(moments, rows.obs), seen(moments, rows.next_obs)
     over = rows.terminated | rows.truncated
-    before: Any = {}
+    before: Any = {"counts": filled}
     if rows.memory is not None:
         begins = jnp.append(True, over[:-1])
         means, value, after, memories = _told_in_order(networks, obs, next_obs, begins)
-        before = {"counts": filled, "begins": begins, "memories": memories}
+        before |= {"begins": begins, "memories": memories}
     else:
         means, value, after = actor.told(obs), _value(critic, obs), _value(critic, next_obs)
     delta = reward + ppo.gamma * jnp.where(rows.terminated, 0.0, after) - value

@@ -68,10 +68,11 @@ def changed(task: Any, longer: Any) -> str:
     that would."""
     one, other = task.unwrapped, longer.unwrapped
     two = one.longer(2)
-    names = [
-        f.name for f in dataclasses.fields(one) if getattr(one, f.name) != getattr(two, f.name)
-    ]
-    return ", ".join(f"{name} {getattr(other, name):,}" for name in names)
+    fields = [f.name for f in dataclasses.fields(one)]
+    names = [name for name in fields if repr(getattr(one, name)) != repr(getattr(two, name))]
+    values = [getattr(other, name) for name in names]
+    told = [f"{x:,}" if isinstance(x, int | float) else str(x) for x in values]
+    return ", ".join(map(" ".join, zip(names, told, strict=True)))
 
 
 class Worth(NamedTuple):

@@ -190,7 +190,7 @@ def _network(line: Line, name: str | None, algorithm: str, env: Any) -> Any:
     if ALGORITHMS[algorithm].get("gradient"):
         fields = fields | NETWORKS[name].get("gradient", {})
     network = load(NETWORKS[name]["path"])(**fields)
-    if env.discrete and hasattr(network, "output_activation"):
+    if env.discrete and not env.masked and hasattr(network, "output_activation"):
         network = dataclasses.replace(network, output_activation="relative")
     if env.agents is not None and not network.team and algorithm != "ccea":
         from ..networks.team import Team

@@ -70,7 +70,7 @@ NOUNS = {int: "a whole number", float: "a number", bool: "True or False", types.
 
 
 def in_words(kind: Any) -> str:
-    """A type, for people: `whole numbers, as in 1,2,3`."""
+    """A type, for people: `whole numbers with commas between, or None`."""
     origin, inside = typing.get_origin(kind), typing.get_args(kind)
     if origin in (types.UnionType, typing.Union):
         return ", or ".join(in_words(part) for part in inside)

@@ -130,6 +130,11 @@ class Single:
                 self._masks.pop(i, None)
             return
         mask = np.asarray(mask)
+        if not self.masked:
+            raise Fault(
+                "returned an action_mask in step and none in reset",
+                "give it in both, so that learners know that there is one",
+            )
         if mask.shape != (self.action_size,) or mask.dtype.kind not in "biu":
             raise Fault(
                 f"returned an action_mask of shape {mask.shape} and dtype {mask.dtype}",

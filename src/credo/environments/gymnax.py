@@ -24,8 +24,8 @@ from .base import AbstractEnvironment
 if importlib.util.find_spec("gymnax") is None:
     raise ModuleNotFoundError("tasks of gymnax need it: `pip install gymnax`")
 
-import gymnax
-from gymnax.environments import spaces
+import gymnax  # pyright: ignore[reportMissingImports]
+from gymnax.environments import spaces  # pyright: ignore[reportMissingImports]
 
 
 @functools.cache

@@ -16,10 +16,18 @@ from .wrappers import AbstractHostWrapper, AbstractWrappedCopies, AbstractWrappe
 
 def with_last_step(env: AbstractEnvironment | AbstractHostEnvironment):
     """A task whose observations end with the last action, in [-1, 1], and the last reward, of its
-    first signal; zeros at the start of an episode."""
+    first signal; zeros at the start of an episode. Of discrete actions the one that a policy chose
+    is 1 and the others are -1, whatever numbers it chose by."""
     if isinstance(env, AbstractHostEnvironment):
         return LastHostStep(env)
     return LastStep(env)
+
+
+def chosen(xp: Any, action: Any) -> Any:
+    """Actions `[..., act]` with 1 for the largest number of each and -1 for the others. `xp`: NumPy
+    or that of JAX."""
+    largest = xp.argmax(action, axis=-1)[..., None]
+    return xp.where(xp.arange(action.shape[-1]) == largest, xp.float32(1.0), xp.float32(-1.0))
 
 
 class LastStep(AbstractWrapper):
@@ -39,7 +47,7 @@ class LastStep(AbstractWrapper):
 
     def step(self, state: PyTree, action: Array, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
         state, now = self.env.step(state, action, key=key)
-        return state, self._told(now, action)
+        return state, self._told(now, chosen(jnp, action) if self.env.discrete else action)
 
     def _told(self, now: TimeStep, action: Array) -> TimeStep:
         earned = now.rewards[self.env.signals[0]]
@@ -66,15 +74,16 @@ class LastHostStep(AbstractHostWrapper):
         return self.env.task_record() | {"obs_size": self.obs_size, "observations": None}
 
     def around(self, inner: AbstractCopies) -> "LastStepCopies":
-        return LastStepCopies(inner, self.env.action_size, self.env.signals[0])
+        env = self.env
+        return LastStepCopies(inner, env.action_size, env.signals[0], env.discrete)
 
 
 class LastStepCopies(AbstractWrappedCopies):
     """Copies whose observations end with the last step."""
 
-    def __init__(self, inner: AbstractCopies, action_size: int, signal: str):
+    def __init__(self, inner: AbstractCopies, action_size: int, signal: str, discrete: bool):
         self.inner, self.n = inner, inner.n
-        self._size, self._signal = action_size, signal
+        self._size, self._signal, self._discrete = action_size, signal, discrete
 
     def reset(self, seeds: np.ndarray, active: np.ndarray) -> np.ndarray:
         obs = self.inner.reset(seeds, active)
@@ -82,7 +91,8 @@ class LastStepCopies(AbstractWrappedCopies):
 
     def step(self, actions: np.ndarray, active: np.ndarray) -> HostStep:
         now = self.inner.step(actions, active)
-        obs = self._told(now.obs, np.clip(actions, -1.0, 1.0), now.rewards[self._signal])
+        done = chosen(np, actions) if self._discrete else np.clip(actions, -1.0, 1.0)
+        obs = self._told(now.obs, done, now.rewards[self._signal])
         return dataclasses.replace(now, obs=obs)
 
     def _told(self, obs: np.ndarray, action: np.ndarray, earned: Any) -> np.ndarray:

@@ -108,6 +108,8 @@ class AbstractWrapper(AbstractEnvironment):
     agents = _of("env", "agents")
     reported = _of("env", "reported")
     unwrapped = _of("env", "unwrapped")
+    discrete = _of("env", "discrete")
+    masked = _of("env", "masked")
 
     def bare(self, state: PyTree) -> PyTree:
         return self.env.bare(state)

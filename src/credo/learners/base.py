@@ -298,5 +298,5 @@ def require_critic(asked: Any, learners: tuple[AbstractLearner, ...]) -> None:
     if type(learners[0]).value is AbstractLearner.value:
         raise ValueError(
             f"{name} asks the critic of the first learner, and {type(learners[0]).__name__} has no "
-            "method `value`: put TD3, DDPG or SAC first"
+            "method `value`: put TD3, DDPG, SAC or DQN first"
         )

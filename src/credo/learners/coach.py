@@ -44,6 +44,11 @@ class AbstractCoach(eqx.Module):
         """Raise unless the first learner has a critic, and so many members are neither `kept` as
         elites nor actors of learners."""
         require_critic(self, learners)
+        if learners[0].discrete:
+            raise ValueError(
+                f"{type(self).__name__} moves members by the gradient of a critic, and there is "
+                f"none through the discrete actions of {type(learners[0]).__name__}: give no coach"
+            )
         most = population - kept - len(learners)
         if not 1 <= self.count(population) <= most:
             raise ValueError(

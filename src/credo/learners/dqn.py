@@ -40,15 +40,15 @@ from .base import (
     spoken,
 )
 
-DQN_NETWORK = MLP(
-    hidden=(256, 256), activation="relu", initializer="uniform", output_activation="relative"
-)
+DQN_NETWORK = MLP(hidden=(256, 256), activation="relu", initializer="uniform")
 
 
 def choosing(env: AbstractTask, network: MLP) -> MLP:
     """A network with outputs of which the largest is found whatever their size, if a task has
-    discrete actions. It opens one outside JAX."""
-    return replace(network, output_activation="relative") if env.discrete else network
+    discrete actions. It opens one outside JAX. Where some are not allowed the second largest may
+    count, and outputs stay as they are."""
+    apart = env.discrete and not env.masked
+    return replace(network, output_activation="relative") if apart else network
 
 
 class ActionValues(eqx.Module):
@@ -72,6 +72,7 @@ class DQNState(eqx.Module):
     values: ActionValues
     target: ActionValues
     opt: optax.OptState
+    begun: Float[Array, ""]  # updates that exploration is ahead of those that were made
 
 
 class DQN(AbstractLearner):
@@ -112,12 +113,12 @@ class DQN(AbstractLearner):
             initializer = getattr(network, "initializer", "uniform")
             head = draw_layers((units, 1), initializer, key=head_key)
         values = ActionValues(policy, head)
-        return DQNState(values, values, adam_state(values))
+        return DQNState(values, values, adam_state(values), jnp.float32(0.0))
 
     def update(self, state: DQNState, batch: Batch, *, key: Any) -> tuple[DQNState, Metrics]:
         given = (state.values, batch, self.target(state, batch))
         values, opt, (loss, q) = descend(error, given, state.opt, self.learning_rate)
-        state = DQNState(values, polyak(state.target, values, self.tau), opt)
+        state = DQNState(values, polyak(state.target, values, self.tau), opt, state.begun)
         return state, {"critic_loss": loss, "q": q}
 
     def target(self, state: DQNState, batch: Batch) -> Returns:
@@ -131,7 +132,7 @@ class DQN(AbstractLearner):
         return state.values.policy
 
     def explorer(self, state: DQNState, random: Bool[Array, ""]) -> AbstractPolicy:
-        done = adam_steps(state.opt).astype(jnp.float32) / self.exploration
+        done = (state.begun + adam_steps(state.opt).astype(jnp.float32)) / self.exploration
         ε = jnp.maximum(self.epsilon, 1.0 - (1.0 - self.epsilon) * done)
         return EpsilonGreedy(state.values.policy, ε, random)
 
@@ -140,8 +141,9 @@ class DQN(AbstractLearner):
         return _of(state.values(batch), acts(policy, batch))
 
     def warm(self, state: DQNState, actor: AbstractPolicy) -> DQNState:
-        places = lambda s: (s.values.policy, s.target.policy)  # noqa: E731
-        return eqx.tree_at(places, state, (actor, actor))
+        """Also without the exploration of one who knows nothing."""
+        places = lambda s: (s.values.policy, s.target.policy, s.begun)  # noqa: E731
+        return eqx.tree_at(places, state, (actor, actor, jnp.float32(self.exploration)))
 
 
 def error(values: ActionValues, batch: Batch, target: Returns) -> tuple[Array, Array]:

@@ -143,7 +143,6 @@ class Criticised(AbstractLearner):
     """
 
     metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "q", "fitness_critic_loss")
-    teams: ClassVar[bool] = True
 
     learner: AbstractLearner = TD3(signal="global", reward_scale=50.0, **TEAM)
     """What learns, from the critic's reward; its `signal` is what the critic predicts."""
@@ -161,6 +160,14 @@ class Criticised(AbstractLearner):
     @property
     def signal(self) -> str | None:
         return self.learner.signal
+
+    @property
+    def teams(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.learner.teams
+
+    @property
+    def discrete(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.learner.discrete
 
     @property
     def batch_size(self) -> int:

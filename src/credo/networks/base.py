@@ -30,7 +30,7 @@ ACTIVATIONS = {
 OutputActivation = Literal["sigmoid", "tanh", "relative"]
 """What turns an output into an action in [-1, 1]. `relative`, for discrete actions: how far each
 output is below the largest, tanh(u - max u). The largest is found again, whatever their size, where
-other activations saturate at numbers above 9, and all are alike."""
+other activations saturate at numbers above 9, and all are alike. Those far below it are alike."""
 OUTPUTS = {
     "sigmoid": ACTIVATIONS["sigmoid"],
     "tanh": ACTIVATIONS["tanh"],

@@ -15,7 +15,7 @@ from matplotlib.patches import FancyArrowPatch
 
 from .. import tree
 from ..analysis.memory import known_memory, weightings
-from ..analysis.probes import reach, worth_of_cells
+from ..analysis.probes import TIMES, reach, worth_of_cells
 from ..compilation import float32
 from ..environments.base import AbstractEnvironment, AbstractSequenceTask
 from ..environments.wrappers import Given
@@ -32,6 +32,7 @@ MOST = 10_000  # steps of an episode that is played for it
 LONGEST = 120  # moments of an episode that a heat map shows
 FAINT = 0.01  # rows behind the last that reaches this are left out
 PLAYED = 50  # episodes of a probe
+STEPS = 20_000_000  # of all episodes by which cells are judged, at most: some seconds
 ROWS = 16  # cells in a table
 DRAWN = 16  # sequences, of which one is shown
 SEED = 1_000_003  # of the episodes of probes
@@ -215,9 +216,11 @@ def _memories(env: AbstractEnvironment, policy: Any) -> Iterator[HeatMap]:
 def horizon(env: AbstractEnvironment, policy: Any) -> Iterator[Figure]:
     """How the score falls where something has to be remembered for longer than in training;
     nothing of a task that has no setting for it."""
-    if env.longer(1) is None:
+    tasks = {n: env.longer(n) for n in TIMES}
+    times = [n for n, longer in tasks.items() if longer is not None and longer.max_steps <= MOST]
+    if not times:
         return
-    found = reach(env, tree.single(policy), episodes=PLAYED, key=jax.random.key(SEED))
+    found = reach(env, tree.single(policy), times, PLAYED, key=jax.random.key(SEED))
     scores = np.array([[step.scores.mean() for step in found]])
     settings = "; ".join(f"× {step.times}: {step.changed}" for step in found)
     yield Figure(
@@ -233,6 +236,10 @@ def horizon(env: AbstractEnvironment, policy: Any) -> Iterator[Figure]:
 
 def cells(env: AbstractEnvironment, policy: Any) -> Iterator[Table]:
     """What each memory cell is worth: the most needed first, at most `ROWS` of them."""
+    memory = known_memory(policy.start(key=jax.random.key(0)))
+    lanes = 0 if memory is None or not memory.ndim else 2 * memory.shape[-1] + 2
+    if not 0 < lanes * PLAYED * env.max_steps <= STEPS:
+        return
     found = worth_of_cells(env, policy, PLAYED, key=jax.random.key(SEED))
     if found is None:
         return

@@ -83,7 +83,6 @@ def describe(
     return list(_lines(run, task, result)), result
 
 
-@float32()
 def horizon(
     run: Run, task: Any, times: Sequence[int], episodes: int | None, seed: int
 ) -> Iterator[str]:
@@ -92,12 +91,13 @@ def horizon(
     **Arguments:** `times`: how many times as long as in `task`, at least 1; none: `TIMES`.
     `episodes`: of each; None: 100. `seed` as in `played`.
     """
-    episodes = episodes or 100
-    policies, title = tree.single(run.champion), f"{run.path}: {task.reported} in {episodes} fresh"
+    episodes, title = episodes or 100, f"{run.path}: {task.reported} in "
     for n in sorted(set(times)) or TIMES:
-        (found,) = probes.reach(task, policies, (n,), episodes, key=_key(seed))
+        with float32():
+            policies = tree.single(run.champion)
+            (found,) = probes.reach(task, policies, (n,), episodes, key=_key(seed))
         if title:
-            yield f"{title} episodes of each"
+            yield f"{title}{episodes} fresh episodes of each"
             title = ""
         score = _score(found.scores[0])
         error = "" if np.isnan(score.error) else f" ± {score.error:.2g}"
