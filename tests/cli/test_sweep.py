@@ -109,8 +109,11 @@ CEM = 'breeder = ["genetic", "cem"]\n'
         (f"depth = 2\n{ranged('depth = [3, 4]')}", "sets depth, and has a range of it: leave one"),
         (ranged('selection = ["tournament", "best"]'), "no selection 'best'"),
         (ranged("selection = { low = 1, high = 2 }"), "no selection '1'"),
-        (ranged("population-size = { low = 6.5, high = 8 }"), "it must be int"),
-        (ranged("population-size = [6, 'many']"), "--population-size is 'many': it must be int"),
+        (ranged("population-size = { low = 6.5, high = 8 }"), "it must be a whole number"),
+        (
+            ranged("population-size = [6, 'many']"),
+            "--population-size is 'many': it must be a whole number",
+        ),
         (ranged("network.hidden = { low = 0, high = 3 }"), "hidden is 0: it must be at least 1"),
         (ranged("normalize-observations = { low = 0, high = 1 }"), "takes no numbers: give a list"),
         (ranged('normalize-observations = ["yes", "no"]'), "is true or false, not yes or no"),

@@ -38,8 +38,6 @@ NETWORKS = [
     *(MLP((6, 5), a, n) for a in ACTIVATIONS for n in ("none", "before", "after")),
     MLP((), output_activation="sigmoid"),
     MLP((4,), "relu", "before", "sigmoid", initializer="uniform"),
-    MLP((4,), output_activation="relative"),
-    MMU(4, output_activation="relative"),
     MMU(4),
     *(MMU(4, block_activation=a, encoder_activation="tanh") for a in ("tanh", "relu", "elu")),
     MMU(4, encoder_activation="sigmoid", decoder_activation="tanh", output_activation="tanh"),
@@ -49,11 +47,18 @@ NETWORKS = [
     MMU(4, start_weights="saturated"),
     *(Graph(4, activation=a, passes=p) for a in ("sigmoid", "tanh") for p in (1, 3)),
     Graph(4, "lstm"),
-    *(Recurrent(c, 4, o) for c in ("rnn", "gru", "lstm") for o in ("sigmoid", "tanh", "relative")),
+    *(Recurrent(c, 4, o) for c in ("rnn", "gru", "lstm") for o in ("sigmoid", "tanh")),
     NTM("lstm", hidden=4, rows=6, width=3),
     NTM("feedforward", 4, 5, 3, 2, 2, 2, start_memory="constant", output_activation="tanh"),
     DNC(hidden=4, rows=5, width=3, read_heads=2),
     DNC("feedforward", 4, 4, 3, 1, "tanh", "fan_in"),
+]
+RELATIVE = [
+    MLP((4,), output_activation="relative"),
+    MMU(4, output_activation="relative"),
+    Recurrent("gru", 4, "relative"),
+    NTM(hidden=4, rows=5, width=3, output_activation="relative"),
+    DNC(hidden=4, rows=4, width=3, output_activation="relative"),
 ]
 AGENTS = 3
 HEADS = (MLP((), initializer="uniform"), MMU(3), Recurrent("gru", 3), Recurrent("lstm", 3))
@@ -138,6 +143,16 @@ def test_the_runner_acts_as_the_champion_over_an_episode(tmp_path, network):
     act.reset()
     again = np.array([act(obs) for obs in observations()])
     np.testing.assert_array_equal(again, theirs)
+
+
+@pytest.mark.parametrize("network", RELATIVE, ids=str)
+def test_the_runner_chooses_as_the_champion(network):
+    champion = network.init(3, 3, key=jax.random.key(0))
+    policy, act = Policy(champion), loaded(champion, obs_size=3, action_size=3)
+    ours = np.array([policy(obs) for obs in observations()])
+    assert (ours.max(axis=1) == 0).all()
+    assert ours.std(axis=0).max() > 1e-3
+    np.testing.assert_allclose([act(obs) for obs in observations()], ours, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("network", TEAMS, ids=str)
