@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-pytest.importorskip("gymnax")
+pytest.importorskip("gymnax", reason="it wants a Gymnasium below ours, 1.4")
 
 from credo import rollout, tree
 from credo.environments import checks

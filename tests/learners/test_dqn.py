@@ -31,7 +31,7 @@ def said(policy, obs):
 
 
 def values(of, obs):
-    """The same with the duelling head, if there is one."""
+    """The same with the dueling head, if there is one."""
     hidden, q = said(of.policy, obs)
     if of.head is None:
         return q
@@ -47,7 +47,7 @@ def batch(seed, **more):
     return Batch(*map(jnp.asarray, (obs, action, reward, after, ended, np.arange(N) == 1)), **more)
 
 
-@pytest.fixture(scope="module", params=[{}, {"double": False}, {"duelling": True}])
+@pytest.fixture(scope="module", params=[{}, {"double": False}, {"dueling": True}])
 def learned(request):
     """A learner and its state after two updates, so that target and network differ."""
     learner = dataclasses.replace(LEARNER, **request.param)

@@ -17,6 +17,8 @@ Departures from the printed boxes:
 - Mutation adds noise in proportion to a weight and hits matrices alone, as the author's code.
 - All members of a generation play in the same worlds; crossover draws rows independently.
 - A learner's first return is its value, and returns that are no numbers leave it as it is.
+- Of discrete actions the learner is DQN, and CERL's are four of it; networks with memory learn from
+  windows, at an update per four frames.
 - Time limits bootstrap, both gradients are clipped, and OU noise starts anew with each episode.
 - No actor is injected in a generation without updates.
 - Non-finite episodes (an observation, action or reward that is NaN or infinite) are discarded: they

@@ -6,6 +6,7 @@ each of several learners may optimise a signal of its own: a level of credit per
 
 Departures from the printed box:
 
+- On a task without a reward `local` the preset's learner maximises what evolution does.
 - Line 8 lets every team play with noise; as the text (7.3) and the author's code say, only the
   learner's team does.
 - The box prints no mutation; the text and the code mutate. Operators are those of ERL.
@@ -59,7 +60,8 @@ BREEDER = replace(ERL_BREEDER, elite_fraction=0.2, crossover_probability=0.1)
 
 
 def _local(env: Environment) -> TD3:
-    """`LOCAL`, or on a task without such a reward its twin for the task's first one."""
+    """`LOCAL`, or on a task without such a reward its twin for what evolution maximises, with a
+    warning."""
     if "local" in env.signals:
         return LOCAL
     several = len(env.signals) > 1

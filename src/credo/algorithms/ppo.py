@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .. import require, tree
 from ..compilation import float32, jit
-from ..learners.base import act, adam, adam_state, averaged, mean, window_of
+from ..learners.base import act, adam, adam_state, averaged, mean, windows_of
 from ..learners.dqn import choosing
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.exploration import Categorical, Explorer, GaussianNoise
@@ -190,7 +190,7 @@ class PPO(eqx.Module):
         with memory minibatches hold 8 windows, of whole episodes where those are short."""
         given: dict[str, Any] = {"network": network or choosing(env, NETWORK)}
         if network is not None and network.remembers:
-            window = window_of(env)
+            window = windows_of(env).window
             given |= {"window": window, "batch_size": 8 * window}
         return cls(env, **given | overrides)
 

@@ -12,6 +12,7 @@ and the best possible return is written beside it.
 | `Meet` | both agents of a team act | 1 (global) | 0 |
 """
 
+import abc
 from typing import ClassVar
 
 import equinox as eqx
@@ -29,23 +30,13 @@ class CopyState(eqx.Module):
     step: Int[Array, ""]
 
 
-class Copy(AbstractEnvironment):
-    """Act as you see: the reward is minus the squared distance of action and observation.
-
-    Each observation is uniform in [-1, 1], independent of all before it and of the actions. The
-    clock ends the episode (truncated). Best return 0; the action 0 has -size·max_steps/3 on
-    average.
-    """
+class AbstractAnswer(AbstractEnvironment):
+    """Answer each observation with as many numbers. Each is drawn anew, independent of all before
+    it and of the actions. The clock ends the episode (truncated)."""
 
     signals: ClassVar[tuple[str, ...]] = ("reward",)
-    obs_range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
 
-    size: int = eqx.field(static=True, default=1)  # numbers to copy, at least 1
-    max_steps: int = eqx.field(static=True, default=10)  # length of every episode, at least 1
-
-    def __check_init__(self):
-        require.at_least("size", self.size, 1)
-        require.at_least("max_steps", self.max_steps, 1)
+    size: eqx.AbstractVar[int]  # numbers in an observation and in an action
 
     @property
     def obs_size(self) -> int:
@@ -55,29 +46,52 @@ class Copy(AbstractEnvironment):
     def action_size(self) -> int:
         return self.size
 
+    @abc.abstractmethod
+    def drawn(self, key: PRNGKeyArray) -> Float[Array, " size"]:
+        """An observation."""
+
+    @abc.abstractmethod
+    def paid(self, obs: Float[Array, " size"], action: Float[Array, " size"]) -> Float[Array, ""]:
+        """The reward of an answer."""
+
     def reset(self, *, key: PRNGKeyArray) -> tuple[CopyState, TimeStep]:
         return self._at(jnp.int32(0), jnp.float32(0.0), key)
 
     def step(
         self, state: CopyState, action: Float[Array, " size"], *, key: PRNGKeyArray
     ) -> tuple[CopyState, TimeStep]:
-        return self._at(state.step + 1, -jnp.sum((action - state.obs) ** 2), key)
+        return self._at(state.step + 1, self.paid(state.obs, action), key)
 
     def _at(self, step, reward, key):
-        obs = jax.random.uniform(key, (self.size,), minval=-1.0, maxval=1.0)
-        truncated = step >= self.max_steps
+        obs, truncated = self.drawn(key), step >= self.max_steps
         return CopyState(obs, step), TimeStep(obs, {"reward": reward}, jnp.bool_(False), truncated)
 
 
-class Choose(AbstractEnvironment):
-    """Choose what you see: the reward is 1 if the largest entry of the action is where the
-    observation has its 1, of `size` places.
-
-    Each observation is drawn anew. The clock ends the episode (truncated). Best return `max_steps`;
-    by chance one `size`-th of it.
+class Copy(AbstractAnswer):
+    """Act as you see: the reward is minus the squared distance of action and observation, whose
+    numbers are uniform in [-1, 1]. Best return 0; the action 0 has -size·max_steps/3 on average.
     """
 
-    signals: ClassVar[tuple[str, ...]] = ("reward",)
+    obs_range: ClassVar[tuple[float, float]] = (-1.0, 1.0)
+
+    size: int = eqx.field(static=True, default=1)  # numbers to copy, at least 1
+    max_steps: int = eqx.field(static=True, default=10)  # length of every episode, at least 1
+
+    def __check_init__(self):
+        require.at_least("size", self.size, 1)
+        require.at_least("max_steps", self.max_steps, 1)
+
+    def drawn(self, key):
+        return jax.random.uniform(key, (self.size,), minval=-1.0, maxval=1.0)
+
+    def paid(self, obs, action):
+        return -jnp.sum((action - obs) ** 2)
+
+
+class Choose(AbstractAnswer):
+    """Choose what you see: the reward is 1 if the largest entry of the action is where the
+    observation has its 1. Best return `max_steps`; by chance one `size`-th of it."""
+
     obs_range: ClassVar[tuple[float, float]] = (0.0, 1.0)
     discrete: ClassVar[bool] = True
 
@@ -88,27 +102,11 @@ class Choose(AbstractEnvironment):
         require.at_least("size", self.size, 2)
         require.at_least("max_steps", self.max_steps, 1)
 
-    @property
-    def obs_size(self) -> int:
-        return self.size
+    def drawn(self, key):
+        return jax.nn.one_hot(jax.random.randint(key, (), 0, self.size), self.size)
 
-    @property
-    def action_size(self) -> int:
-        return self.size
-
-    def reset(self, *, key: PRNGKeyArray) -> tuple[CopyState, TimeStep]:
-        return self._at(jnp.int32(0), jnp.float32(0.0), key)
-
-    def step(
-        self, state: CopyState, action: Float[Array, " size"], *, key: PRNGKeyArray
-    ) -> tuple[CopyState, TimeStep]:
-        right = jnp.argmax(action) == jnp.argmax(state.obs)
-        return self._at(state.step + 1, right.astype(jnp.float32), key)
-
-    def _at(self, step, reward, key):
-        obs = jax.nn.one_hot(jax.random.randint(key, (), 0, self.size), self.size)
-        truncated = step >= self.max_steps
-        return CopyState(obs, step), TimeStep(obs, {"reward": reward}, jnp.bool_(False), truncated)
+    def paid(self, obs, action):
+        return (jnp.argmax(action) == jnp.argmax(obs)).astype(jnp.float32)
 
 
 class LockedState(eqx.Module):

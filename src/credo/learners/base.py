@@ -79,18 +79,18 @@ class AbstractLearner(eqx.Module):
         """`state` that goes on from a given actor."""
 
 
-def window_of(env: AbstractTask) -> int:
-    """Rows of a window on this task: a whole episode if none has more than 128 steps, else 64.
-    What is asked for at an episode's end was often told at its start."""
-    return env.max_steps if env.max_steps <= WHOLE else 64
+def windows_of(env: AbstractTask) -> Sampling:
+    """Windows for a task: whole episodes if none has more than 128 steps, else 64 rows behind 16 of
+    burn-in. What is asked for at an episode's end was often told at its start."""
+    whole = env.max_steps <= WHOLE
+    return Sampling(window=env.max_steps, burn_in=0) if whole else Sampling(window=64, burn_in=16)
 
 
 def in_windows(
     env: AbstractTask, network: AbstractNetwork | None, settings: dict[str, Any]
 ) -> dict[str, Any]:
     """Settings of an algorithm with its `learner`, or `learners`, for a network that may have
-    memory: windows of `window_of` the task, behind 16 rows of burn-in where episodes are longer;
-    minibatches of at least 1,024 rows, and four frames to an update. It costs 2.4 times that of as
+    memory: windows as `windows_of` the task; minibatches of at least 1,024 rows, and four frames to an update. It costs 2.4 times that of as
     many frames without memory (docs, recurrent)."""
     if network is None or not network.remembers:
         return settings
@@ -98,9 +98,7 @@ def in_windows(
     def larger(learner: Any) -> Any:
         return replace(learner, batch_size=max(learner.batch_size, 1024))
 
-    whole = env.max_steps <= WHOLE
-    sampling = Sampling(window=window_of(env), burn_in=0 if whole else 16)
-    found: dict[str, Any] = {"sampling": sampling} | settings
+    found: dict[str, Any] = {"sampling": windows_of(env)} | settings
     if "learner" in found:
         found["learner"] = larger(found["learner"])
     if "learners" in found:

@@ -1,13 +1,14 @@
 """DQN: Mnih et al. (2015), "Human-level control through deep reinforcement learning", Algorithm 1,
-for discrete actions; with double Q-learning (van Hasselt et al. 2016), duelling values (Wang et al.
+for discrete actions; with double Q-learning (van Hasselt et al. 2016), dueling values (Wang et al.
 2016, equation 9) and returns of n steps (`sampling.steps`).
 
 Departures:
 
 - The value of an action is what a policy says before its output activation, so that the network
   that learns is one that a population can hold, and evolution moves what the gradient learned.
+- ε falls with updates, not with frames; beside a population most frames are not the learner's.
 - Targets follow by Polyak averaging, where the paper copies weights now and then.
-- Duelling networks share all layers but the last.
+- Dueling networks share all layers but the last.
 """
 
 from dataclasses import replace
@@ -17,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .. import require
 from ..environments.base import AbstractTask
@@ -52,11 +53,11 @@ def choosing(env: AbstractTask, network: MLP) -> MLP:
 
 
 class ActionValues(eqx.Module):
-    """Q(s, ·): what a policy says, or with a duelling head how that differs from its own mean,
+    """Q(s, ·): what a policy says, or with a dueling head how that differs from its own mean,
     beside the value of the state."""
 
     policy: AbstractPolicy
-    head: dict[str, Float[Array, "..."]] | None  # W_0, b_0: features to V(s); None: not duelling
+    head: dict[str, Float[Array, "..."]] | None  # W_0, b_0: features to V(s); None: not dueling
 
     def __call__(self, batch: Batch, later: bool = False) -> Float[Array, "act batch"]:
         """In the rows of a batch, or in what follows them."""
@@ -86,7 +87,7 @@ class DQN(AbstractLearner):
     tau: float = 5e-3  # share of the new weights in the target network per update, in [0, 1]
     double: bool = eqx.field(static=True, default=True)
     """The network chooses the next action and its target values it; else the target does both."""
-    duelling: bool = eqx.field(static=True, default=False)
+    dueling: bool = eqx.field(static=True, default=False)
     """Values of actions are differences from a value of the state."""
     epsilon: float = 0.05  # ε in the end: share of steps of any action, in [0, 1]
     exploration: int = 10_000  # updates in which ε falls from 1 to that, at least 1
@@ -109,7 +110,7 @@ class DQN(AbstractLearner):
         policy_key, head_key = jax.random.split(key)
         policy, head = network.init(obs_size, action_size, key=policy_key), None
         units = output_layer(network, policy, obs_size, "DQN")
-        if self.duelling:
+        if self.dueling:
             initializer = getattr(network, "initializer", "uniform")
             head = draw_layers((units, 1), initializer, key=head_key)
         values = ActionValues(policy, head)
@@ -152,7 +153,7 @@ def error(values: ActionValues, batch: Batch, target: Returns) -> tuple[Array, A
     return mean(optax.huber_loss(q, target[0]), batch.active), mean(q, batch.active)
 
 
-def _of(q: Float[Array, "act batch"], action: Float[Array, "batch act"]) -> PyTree:
+def _of(q: Float[Array, "act batch"], action: Float[Array, "batch act"]) -> Value:
     """The values of actions, of which the largest entry is the one that was taken."""
     taken = jnp.argmax(action, axis=1)[None]
     return jnp.take_along_axis(q, taken, axis=0)[0]

@@ -80,13 +80,10 @@ class Explorer(AbstractPolicy):
         return jnp.where(self.random, drawn, action), (carry, before, key)
 
 
-class EpsilonGreedy(AbstractPolicy):
-    """A policy of discrete actions, of which every action has an equal chance in a share ε of the
-    steps (Mnih et al. 2015)."""
+class AbstractDrawing(AbstractPolicy):
+    """A policy of discrete actions around another one. The carry is that one's, and a key."""
 
-    policy: AbstractPolicy
-    epsilon: Float[Array, ""]  # ε: that share, in [0, 1]; all of it while `random`
-    random: Bool[Array, ""]
+    policy: eqx.AbstractVar[AbstractPolicy]
     features_first: ClassVar[bool] = False
 
     def start(self, *, key: PRNGKeyArray) -> PyTree:
@@ -95,6 +92,15 @@ class EpsilonGreedy(AbstractPolicy):
 
     def remembered(self, carry):
         return self.policy.remembered(carry[0])
+
+
+class EpsilonGreedy(AbstractDrawing):
+    """A policy of discrete actions, of which every action has an equal chance in a share ε of the
+    steps (Mnih et al. 2015)."""
+
+    policy: AbstractPolicy
+    epsilon: Float[Array, ""]  # ε: that share, in [0, 1]; all of it while `random`
+    random: Bool[Array, ""]
 
     def __call__(self, obs, carry):
         carry, key = carry
@@ -105,19 +111,11 @@ class EpsilonGreedy(AbstractPolicy):
         return jnp.where(strays, drawn, action), (carry, key)
 
 
-class Categorical(AbstractPolicy):
+class Categorical(AbstractDrawing):
     """Discrete actions drawn with the probabilities softmax(u) of what a policy says before its
     output activation: 1 for the one that is drawn, -1 for the others."""
 
     policy: AbstractPolicy
-    features_first: ClassVar[bool] = False
-
-    def start(self, *, key: PRNGKeyArray) -> PyTree:
-        policy_key, drawn_key = jax.random.split(key)
-        return self.policy.start(key=policy_key), drawn_key
-
-    def remembered(self, carry):
-        return self.policy.remembered(carry[0])
 
     def __call__(self, obs, carry):
         carry, key = carry
