@@ -90,8 +90,8 @@ def in_windows(
     env: AbstractTask, network: AbstractNetwork | None, settings: dict[str, Any]
 ) -> dict[str, Any]:
     """Settings of an algorithm with its `learner`, or `learners`, for a network that may have
-    memory: windows as `windows_of` the task; minibatches of at least 1,024 rows, and four frames to an update. It costs 2.4 times that of as
-    many frames without memory (docs, recurrent)."""
+    memory: windows of `windows_of` the task, minibatches of at least 1,024 rows, and four frames to
+    an update. It costs 2.4 times that of as many frames without memory (docs, recurrent)."""
     if network is None or not network.remembers:
         return settings
 
