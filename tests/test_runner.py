@@ -341,8 +341,8 @@ def test_what_is_no_plain_file_is_refused_without_waiting(tmp_path, file):
 
 
 def test_another_format_names_the_version_to_use(file):
-    description = described(version=3, credo="9.9.9")
-    told = r"has format 3.*reads 1 and 2: use the runner of Credo 9\.9\.9"
+    description = described(version=4, credo="9.9.9")
+    told = r"has format 4.*reads 1 to 3: use the runner of Credo 9\.9\.9"
     with pytest.raises(ValueError, match=told):
         Runner.load(write(file, description))
 

@@ -48,6 +48,8 @@ from .evolution.selection import AbstractSelection as AbstractSelection
 from .evolution.selection import Tournament as Tournament
 from .evolution.selection import Truncation as Truncation
 from .learners.base import AbstractLearner as AbstractLearner
+from .learners.discrete_sac import DiscreteSAC as DiscreteSAC
+from .learners.dqn import DQN as DQN
 from .learners.manager import UCB as UCB
 from .learners.manager import AbstractManager as AbstractManager
 from .learners.manager import Thompson as Thompson
@@ -59,6 +61,7 @@ from .learners.td3 import maddpg as maddpg
 from .learners.td3 import matd3 as matd3
 from .networks.base import AbstractNetwork as AbstractNetwork
 from .networks.base import AbstractPolicy as AbstractPolicy
+from .networks.choosing import choosing as choosing
 from .networks.dmmu import DMMU as DMMU
 from .networks.dnc import DNC as DNC
 from .networks.exploration import Explorer as Explorer

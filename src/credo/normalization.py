@@ -6,6 +6,7 @@ function here gives back what it got. One generation acts behind the statistics 
 tests, and whoever gets the champion, act behind those that are frozen in it.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -31,6 +32,7 @@ class Moments(eqx.Module):
     count: Int[Array, "*agents"]  # observations so far, at most 2^30 and those of the last rollout
     mean: Float[Array, "*agents obs"]
     variance: Float[Array, "*agents obs"]
+    spared: int = eqx.field(static=True, default=0)  # first numbers that stay as they are
 
     @classmethod
     def first(cls, env: Environment, network: AbstractNetwork | None = None) -> "Moments":
@@ -47,7 +49,7 @@ class Moments(eqx.Module):
         obs_size, _, *team = env.sizes
         shape = (*team, obs_size)
         ones = jnp.ones(shape, jnp.float32)
-        return cls(jnp.zeros(team, jnp.int32), jnp.zeros(shape, jnp.float32), ones)
+        return cls(jnp.zeros(team, jnp.int32), jnp.zeros(shape, jnp.float32), ones, env.barrable)
 
     @property
     def std(self) -> Float[Array, "*agents obs"]:
@@ -55,11 +57,20 @@ class Moments(eqx.Module):
         resolved = jnp.maximum(1e-4, 1e-6 * jnp.abs(self.mean))
         return jnp.sqrt(self.variance + jnp.square(resolved))
 
+    @property
+    def used(self) -> tuple[Float[Array, "*agents obs"], Float[Array, "*agents obs"]]:
+        """Mean and standard deviation by which observations are normalised. What an action may be
+        is no quantity: such numbers stay as they are."""
+        if not self.spared:
+            return self.mean, self.std
+        counts = jnp.arange(self.mean.shape[-1]) >= self.spared
+        return jnp.where(counts, self.mean, 0.0), jnp.where(counts, self.std, 1.0)
+
     def frozen(self, policy: AbstractPolicy) -> Normalized:
-        return Normalized(policy, self.mean, self.std)
+        return Normalized(policy, *self.used)
 
     def scaled(self, obs: Float[Array, "*agents obs"]) -> Float[Array, "*agents obs"]:
-        return scaled(obs, self.mean, self.std)
+        return scaled(obs, *self.used)
 
     def after(self, experience: Experience) -> "Moments":
         """With all that was met in a rollout."""
@@ -102,7 +113,7 @@ def _merged(moments: Moments, n: Array, mean: Array, variance: Array) -> Moments
     away = mean - moments.mean
     spread = (1.0 - share) * moments.variance + share * variance
     spread = spread + share * (1.0 - share) * jnp.square(away)
-    return Moments(count, moments.mean + share * away, spread)
+    return replace(moments, count=count, mean=moments.mean + share * away, variance=spread)
 
 
 def frozen(moments: Moments | None, policy: AbstractPolicy) -> AbstractPolicy:
@@ -148,4 +159,5 @@ def warmed(policy: Any, moments: Moments | None) -> tuple[Any, Moments | None]:
     if not isinstance(policy, Normalized):
         return policy, moments
     count = jnp.full(policy.mean.shape[:-1], TRUSTED, jnp.int32)
-    return policy.policy, Moments(count, policy.mean, jnp.square(policy.std))
+    spared = 0 if moments is None else moments.spared
+    return policy.policy, Moments(count, policy.mean, jnp.square(policy.std), spared)

@@ -65,42 +65,60 @@ def fits(env: Any, network: Any, *learners: Any) -> None:
     if unfit:
         has, instead = f"{env.agents} agents", "Teams learn by TD3 (credo train merl, matd3)"
         raise ValueError(_cannot_learn(env, has, instead, unfit))
-    if getattr(network, "output_activation", None) == "relative" and not env.discrete:
-        raise ValueError(
-            f"output_activation is 'relative' and {getattr(env, 'id', type(env).__name__)} has Box "
-            "actions: that is for a choice, of which the largest output is always 0; give 'tanh'"
-        )
+    made = getattr(network, "choices", None)
+    if made is not None and (made, network.masked) != (tuple(env.choices), env.masked):
+        raise ValueError(_other_choices(env, network))
     if network.team != team:
         raise ValueError(_other_team(env, network))
     if not team and any(getattr(learner, "together", False) for learner in learners):
         raise ValueError(_one_alone(env))
 
 
+def named(network: Any) -> str:
+    """What people call a network: the class of the one within, if there is one."""
+    return type(getattr(network, "network", network)).__name__
+
+
 def actions(env: Any, network: Any, *learners: Any) -> None:
     """Learners that can learn a task's kind of actions. It opens a task outside JAX."""
     for learner in learners:
-        if learner.discrete or env.discrete:
-            choices(env, network, learner)
+        if learner.discrete or env.choices:
+            choices(env, network, learner, single=True)
 
 
-def choices(env: Any, network: Any, learner: Any) -> None:
-    """Discrete actions that a learner can learn, by a network that can say them. All have to be
-    allowed at every step, or what it says would not be what is done; and the largest output has to
-    be found whatever its size, which a learner makes as large as it likes."""
-    if not env.discrete:
+def choices(env: Any, network: Any, learner: Any, single: bool = False) -> None:
+    """Discrete actions that a learner can learn, a `single` choice or several, by a network that
+    chooses as the task asks."""
+    if not env.choices:
         raise ValueError(_cannot_learn(env, "Box actions", "Give TD3, DDPG or SAC", [learner]))
+    if not env.discrete:
+        others = "Give a task that has the one or the other"
+        raise ValueError(_cannot_learn(env, "choices beside a Box", others, [learner]))
     if not learner.discrete:
-        others = "Give DQN (credo train dqn, erl, cerl), or train it by ppo"
+        others = "Give DQN (credo train dqn, erl, cerl, merl), or train one agent by ppo"
         raise ValueError(_cannot_learn(env, "Discrete actions", others, [learner]))
-    if env.masked:
-        others = "Give a task that allows every action"
-        raise ValueError(_cannot_learn(env, "an action_mask", others, [learner]))
-    if getattr(network, "output_activation", None) != "relative":
+    if single and len(env.choices) > 1:
+        others = "Train it by ppo"
+        told = f"{len(env.choices)} choices at a step"
+        raise ValueError(_cannot_learn(env, told, others, [learner]))
+    if getattr(network, "choices", None) is None:
         task, name = getattr(env, "id", type(env).__name__), type(network).__name__
         raise ValueError(
-            f"{task} has Discrete actions, of which learners by gradient choose by outputs of any "
-            f"size: give {name} output_activation='relative'"
+            f"{task} has Discrete actions, which are learned by a network that chooses: give "
+            f"choosing(task, {name}(...)) of credo.networks.choosing, which needs MLP, RNN, GRU, "
+            "LSTM, MMU, NTM or DNC, for a team on a Team"
         )
+
+
+def _other_choices(env: Any, network: Any) -> str:
+    def told(of: Any) -> str:
+        return f"choices of {tuple(of.choices) or 'nothing'}" + ", masked" * bool(of.masked)
+
+    task = getattr(env, "id", type(env).__name__)
+    return (
+        f"{task} has {told(env)}, and the network makes {told(network)}: give choosing(task, "
+        "network) of that task, or for Box actions the network alone"
+    )
 
 
 def _other_team(env: Any, network: Any) -> str:

@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-VERSION = 2  # of the description; files of version 1, which knew one network each, are read too
+VERSION = 3  # of the description; files of 1, which knew one network each, and 2 are read too
 DESCRIPTION, FINGERPRINT = "credo.policy", "credo.sha256"  # their names in the metadata
 EPSILON = 1e-6  # of LayerNorm, relative to the variance
 LARGEST = 2**30  # bytes of a file
@@ -39,9 +39,9 @@ class Runner:
     """
 
     def __init__(self, description: dict[str, Any], weights: Weights):
-        if description["version"] not in (1, VERSION):
+        if description["version"] not in range(1, VERSION + 1):
             raise ValueError(
-                f"it has format {description['version']}, and this runner reads 1 and {VERSION}: "
+                f"it has format {description['version']}, and this runner reads 1 to {VERSION}: "
                 f"use the runner of Credo {description['credo']}, which wrote it"
             )
         if description["version"] == 1:
@@ -86,11 +86,13 @@ class Runner:
 
         - `observation`: `obs_size` numbers in an array of any shape, or in a Discrete its integer.
           Of a team one for each agent, in order, None for one that is not there; or a dict by name
-          of those that are.
-        - `mask`: in a Discrete which of its entries are allowed; None: all.
+          of those that are. Of a task that says what is allowed those numbers may stand in front.
+        - `mask`: which options of a Discrete, or of each choice of a larger space, one after the
+          other, are allowed; None: what the observation says, or all. Of a team one for each.
 
         **Returns:** in a Box of Gymnasium an array of its shape, dtype and units; in a Discrete
-        an integer; for any other task `[action_size]`, float32 in [-1, 1]. Of a team a list of
+        an integer; in a space of several what Gymnasium has there, a dict, a tuple or an array; for
+        any other task `[action_size]`, float32 in [-1, 1]. Of a team a list of
         these, None for an agent that is not there, or a dict if the observation is one; for a task
         of Credo's `[agents, action_size]`.
 
@@ -120,7 +122,8 @@ class Units:
 
     `task` has `obs_size`, `action_size`, `agents` (None: no team); `action` or `actions`: None for
     [-1, 1], or a description of the action space, of a team one for each agent; and where they are
-    known `observations` ({"n", "start"} of a Discrete) and `names` of the agents.
+    known `observations` ({"n", "start"} of a Discrete), `names` of the agents, the options of its
+    `choices`, and whether it is `masked`: whether observations begin with which are allowed.
 
     **Raises:** `ValueError`, or what Python raises, if that makes no sense.
     """
@@ -132,11 +135,15 @@ class Units:
         if agents is not None:
             self.agents = _size("agents", agents, MOST_AGENTS)
         self.names = self._one_each("names", task.get("names"))
+        self._mask = sum(task.get("choices") or ()) if task.get("masked") else 0
+        if not 0 <= self._mask <= min(self.obs_size, self.action_size):
+            raise ValueError(f"choices are {task['choices']}, more than an action or observation")
         self._discrete = task.get("observations") if agents is None else None
         if self._discrete is not None:
             n, start = self._discrete["n"], self._discrete["start"]
-            if n != self.obs_size or type(start) is not int:
-                raise ValueError(f"observations are {self._discrete}: n must be {self.obs_size}")
+            if n != self.obs_size - self._mask or type(start) is not int:
+                n = self.obs_size - self._mask
+                raise ValueError(f"observations are {self._discrete}: n must be {n}")
         spaces = task.get("action", task.get("actions"))
         if agents is None and spaces is not None:
             spaces = [spaces]
@@ -146,13 +153,14 @@ class Units:
 
     def act(self, observation: Any, step: Callable[[np.ndarray], Any], mask: Any = None) -> Any:
         """The action in the task's units that follows from `step`, a policy on float32 arrays."""
-        output = np.asarray(step(self.read(observation)))
+        rows = self.read(observation, mask)
+        output = np.asarray(step(rows))
         if not np.isfinite(output).all():
             raise ValueError(
                 f"the policy's output for {observation!r} is {output}: its weights, or numbers as "
                 "large as these, overflow"
             )
-        own = self.own(output, mask)
+        own = self.own(output, rows[..., : self._mask] > 0.5 if self._mask else mask)
         if isinstance(observation, Mapping):
             return {name: own[k] for k, name in enumerate(self.names) if name in observation}
         if isinstance(own, list):
@@ -160,10 +168,10 @@ class Units:
             return [None if row is None else action for row, action in rows]
         return own
 
-    def read(self, observation: Any) -> np.ndarray:
+    def read(self, observation: Any, mask: Any = None) -> np.ndarray:
         """`[obs_size]`, of a team `[agents, obs_size]`, float32. Raises `ValueError`."""
         if self.agents is None:
-            return self._row(observation)
+            return self._row(observation, mask, 0)
         if isinstance(observation, Mapping):
             observation = self._by_name(observation)
         given = isinstance(observation, np.ndarray | list | tuple)
@@ -172,10 +180,12 @@ class Units:
                 f"the observation is {observation!r}: it must be that of each of {self.agents} "
                 "agents, in order, None for one that is not there"
             )
+        masks = [None] * self.agents if mask is None else self._one_each("mask", mask)
         rows = np.zeros((self.agents, self.obs_size), np.float32)
+        rows[:, : self._mask] = 1.0  # who is not there may do anything
         for k, row in enumerate(observation):
             if row is not None:
-                row = self._row(row)
+                row = self._row(row, masks[k], k)
                 rows[k, : row.size] = row
         return rows
 
@@ -184,16 +194,19 @@ class Units:
         if self._own is None:
             _no_mask(mask)
             return output
-        if self.agents is None:
-            return self._own[0](output, mask)
-        masks = [None] * self.agents if mask is None else self._one_each("mask", mask)
-        return [own(row, mask) for own, row, mask in zip(self._own, output, masks, strict=True)]
+        rows, masks = ([output], [mask]) if self.agents is None else (output, mask)
+        masks = [None] * len(rows) if masks is None else self._one_each("mask", masks)
+        each = zip(self._own, rows, masks, strict=True)
+        own = [read(_barred(row, mask, options)) for (options, read), row, mask in each]
+        return own[0] if self.agents is None else own
 
-    def _row(self, observation: Any) -> np.ndarray:
-        """The observation of one agent. In a team of others it may be shorter than the largest."""
+    def _row(self, observation: Any, mask: Any, k: int) -> np.ndarray:
+        """The observation of agent k. In a team of others it may be shorter than the largest."""
         if self._discrete is not None and np.ndim(observation) == 0:
-            return _one_hot(observation, self._discrete["n"], self._discrete["start"])
-        x = np.asarray(observation, np.float32).ravel()
+            x = _one_hot(observation, self._discrete["n"], self._discrete["start"])
+        else:
+            x = np.asarray(observation, np.float32).ravel()
+        x = self._told(x, mask, k) if self._mask else x
         padded = self.agents is not None and self._own is not None
         if x.size > self.obs_size or (x.size < self.obs_size and not padded):
             raise ValueError(f"the observation has {x.size} numbers: it must have {self.obs_size}")
@@ -201,6 +214,20 @@ class Units:
             # It would stay in the memory of a recurrent network for ever.
             raise ValueError(f"the observation is {x}: NaN and inf are no observations")
         return x
+
+    def _told(self, x: np.ndarray, mask: Any, k: int) -> np.ndarray:
+        """An observation with what is allowed in front, which it may have already."""
+        if x.size <= self.obs_size - self._mask:
+            options = self._mask if self._own is None else self._own[k][0]
+            x = np.append(np.arange(self._mask) < options, x).astype(np.float32)
+        if mask is None:
+            return x
+        allowed = np.asarray(mask, np.bool_).ravel()
+        if allowed.size > self._mask:
+            raise ValueError(f"the mask is {mask}: it must say which of {self._mask} are allowed")
+        return np.concatenate(
+            [allowed, np.zeros(self._mask - allowed.size), x[self._mask :]]
+        ).astype(np.float32)
 
     def _by_name(self, observation: Mapping[Any, Any]) -> list[Any]:
         """An entry for each agent, None for those that are not named."""
@@ -213,18 +240,21 @@ class Units:
         return [observation.get(name) for name in self.names]
 
     def _one_each(self, what: str, values: Any) -> Any:
-        if values is not None and (self.agents is None or len(values) != self.agents):
+        if values is not None and len(values) != (self.agents or 1):
             raise ValueError(f"{what} is {values!r}: it must have one entry for each agent")
         return values
 
-    def _scale(self, space: Any) -> Callable[[np.ndarray, Any], Any]:
-        """What turns an action in [-1, 1], and a mask of a Discrete or None, into a space's own. In
+    def _scale(self, space: Any) -> tuple[int, Callable[[np.ndarray], Any]]:
+        """How many options a space has, and what turns an action in [-1, 1] into one of its own. In
         a team a space may be smaller than the largest: it takes as much as it holds."""
-        size, read = _entries(space) if "n" in space else _box(space)
+        options = sum(_choices(space))
+        cursor = [0, options]  # where the next choice begins, and the next Box
+        read = _reader(space, cursor)
+        size = cursor[1]
         if size > self.action_size or (self.agents is None and size < self.action_size):
             has = f"an action has {size} numbers in its space"
             raise ValueError(f"{has}, and {self.action_size} as such")
-        return read
+        return options, read
 
 
 def _size(what: str, n: Any, most: int | None = None) -> int:
@@ -250,27 +280,69 @@ def _no_mask(mask: Any) -> None:
         raise ValueError("a mask was given: only a Discrete has entries to allow")
 
 
-def _entries(space: Any) -> tuple[int, Callable[[np.ndarray, Any], int]]:
-    """Of a Discrete the number of entries, and what picks the largest that a mask allows."""
-    n, start = _size("n", space["n"]), space["start"]
+def _choices(space: Any) -> list[int]:
+    """Options of each choice in a space."""
+    if "parts" in space:
+        return [n for _, part in space["parts"] for n in _choices(part)]
+    if "nvec" in space:
+        return [_size("nvec", n) for n in space["nvec"]]
+    return [_size("n", space["n"])] if "n" in space else []
+
+
+def _barred(output: np.ndarray, mask: Any, options: int) -> np.ndarray:
+    """An action with -inf for options that a mask does not allow."""
+    if mask is None:
+        return output
+    if not options:
+        _no_mask(mask)
+    mask = np.asarray(mask, np.bool_).ravel()
+    if mask.size < options or not mask[:options].any():
+        raise ValueError(f"the mask is {mask}: it must allow at least one of {options} entries")
+    allowed = np.append(mask[:options], np.ones(output.size - options, np.bool_))
+    return np.where(allowed, output, -np.inf)
+
+
+def _reader(space: Any, cursor: list[int]) -> Callable[[np.ndarray], Any]:
+    """What turns an action into one of a space's own: of the options of a choice it takes the
+    largest. `cursor`: where its choices and its Boxes begin, which is moved on."""
+    if "parts" in space:
+        keys, parts = zip(*space["parts"], strict=True)
+        readers = [_reader(part, cursor) for part in parts]
+        made = (lambda own: dict(zip(keys, own, strict=True))) if space["dict"] else tuple
+        return lambda output: made([read(output) for read in readers])
+    if "nvec" in space:
+        return _several(space, cursor)
+    return _one(space, cursor) if "n" in space else _box(space, cursor)
+
+
+def _one(space: Any, cursor: list[int]) -> Callable[[np.ndarray], int]:
+    """A Discrete."""
+    n, start, at = _size("n", space["n"]), space["start"], cursor[0]
     if type(start) is not int:
         raise ValueError(f"start is {start!r}: it must be an integer")
-
-    def choose(output: np.ndarray, mask: Any) -> int:
-        output = output[:n]
-        if mask is not None:
-            mask = np.asarray(mask, np.bool_).ravel()
-            if mask.size != n or not mask.any():
-                raise ValueError(f"the mask is {mask}: it must allow at least one of {n} entries")
-            output = np.where(mask, output, -np.inf)
-        return int(np.argmax(output)) + start
-
-    return n, choose
+    cursor[0] += n
+    return lambda output: int(np.argmax(output[at : at + n])) + start
 
 
-def _box(space: Any) -> tuple[int, Callable[[np.ndarray, Any], np.ndarray]]:
-    """Of a Box the number of numbers, and what scales an action to its bounds; one of integers gets
-    the nearest."""
+def _several(space: Any, cursor: list[int]) -> Callable[[np.ndarray], np.ndarray]:
+    """A MultiDiscrete or a MultiBinary."""
+    sizes, at = _choices(space), cursor[0]
+    shape, dtype = tuple(space["shape"]), np.dtype(space["dtype"])
+    start = np.asarray(space["start"], dtype)
+    if math.prod(shape) != len(sizes) or start.size != len(sizes) or dtype.kind not in "iu":
+        raise ValueError(f"its action space has {len(sizes)} choices and shape {shape}")
+    ends = np.cumsum(sizes) + at
+    cursor[0] = int(ends[-1])
+
+    def choose(output: np.ndarray) -> np.ndarray:
+        parts = [output[end - n : end] for end, n in zip(ends, sizes, strict=True)]
+        return (np.array([np.argmax(x) for x in parts], dtype) + start).reshape(shape)
+
+    return choose
+
+
+def _box(space: Any, cursor: list[int]) -> Callable[[np.ndarray], np.ndarray]:
+    """A Box: an action is scaled to its bounds; one of integers gets the nearest."""
     low, high = np.array(space["low"], np.float64), np.array(space["high"], np.float64)
     shape, dtype = tuple(space["shape"]), np.dtype(space["dtype"])
     bounded = np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()
@@ -278,14 +350,14 @@ def _box(space: Any) -> tuple[int, Callable[[np.ndarray, Any], np.ndarray]]:
         raise ValueError(f"its action space has low {low}, high {high} and shape {shape}")
     if dtype.kind not in "fiu":
         raise ValueError(f"its action space has dtype {dtype}: it must be one of numbers")
-    center, half, size = (low + high) / 2, (high - low) / 2, low.size
+    center, half, at, end = (low + high) / 2, (high - low) / 2, cursor[1], cursor[1] + low.size
+    cursor[1] = end
 
-    def scale(output: np.ndarray, mask: Any) -> np.ndarray:
-        _no_mask(mask)
-        own = np.minimum(np.maximum(center + half * output[:size], low), high)
+    def scale(output: np.ndarray) -> np.ndarray:
+        own = np.minimum(np.maximum(center + half * output[at:end], low), high)
         return (own if dtype.kind == "f" else np.rint(own)).astype(dtype).reshape(shape)
 
-    return size, scale
+    return scale
 
 
 # ----------------------------------------------------------------------------------- networks
@@ -362,10 +434,16 @@ ACTIVATIONS = {
 }
 
 
-def _act(x: np.ndarray, activation: str) -> tuple[np.ndarray, np.ndarray]:
-    """The output, and as an action in [-1, 1]."""
-    y = np.tanh(x - x.max()) if activation == "relative" else ACTIVATIONS[activation](x)
-    return y, 2.0 * y - 1.0 if activation == "sigmoid" else y
+class Output:
+    """What an output layer says, x, behind its activation, and as an action in [-1, 1]. Within a
+    network that chooses an action is what was said."""
+
+    def __init__(self, config: dict[str, Any]):
+        self._activation, self._said = config["output_activation"], config.get("said", False)
+
+    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        y = ACTIVATIONS[self._activation](x)
+        return y, x if self._said else 2.0 * y - 1.0 if self._activation == "sigmoid" else y
 
 
 class MLP:
@@ -376,13 +454,13 @@ class MLP:
         self._hidden, depth = Layers(node, node.config), len(node.config["hidden"])
         self._w = node.claim(f"W_{depth}", node.y, self._hidden.size)
         self._b = node.claim(f"b_{depth}", node.y)
-        self._activation = node.config["output_activation"]
+        self._act = Output(node.config)
 
     def start(self, random: "np.random.Generator") -> None:
         return None
 
     def __call__(self, x: np.ndarray, memory: None) -> tuple[np.ndarray, None]:
-        return _act(self._w @ self._hidden(x) + self._b, self._activation)[1], None
+        return self._act(self._w @ self._hidden(x) + self._b)[1], None
 
 
 class Layers:
@@ -422,6 +500,7 @@ class MMU:
 
     def __init__(self, node: Node):
         self.config, shapes = node.config, self._shapes(node.config, node.x, node.y)
+        self._act = Output(node.config)
         self.weights = {name: node.claim(name, *shape) for name, shape in shapes}
 
     @staticmethod
@@ -457,7 +536,7 @@ class MMU:
         cumulative = m + written
         interpolated = written + (1.0 - w) * m
         m = (1.0 - alpha) * cumulative + alpha * interpolated if alpha else cumulative
-        y, action = _act(weights["Z_y"] @ h + weights["b_y"], c["output_activation"])
+        y, action = self._act(weights["Z_y"] @ h + weights["b_y"])
         return action, (y, m)
 
     def _gate(self, name: str, x: np.ndarray, y: np.ndarray, m: np.ndarray) -> np.ndarray:
@@ -474,7 +553,7 @@ class Recurrent:
     GATES: ClassVar[dict[str, str]] = {"rnn": "h", "gru": "zrh", "lstm": "ifoc"}
 
     def __init__(self, node: Node):
-        self.cell, self._activation = node.config["cell"], node.config["output_activation"]
+        self.cell, self._act = node.config["cell"], Output(node.config)
         h = node.config["hidden"]
         self.weights = {"Z_y": node.claim("Z_y", node.y, h), "b_y": node.claim("b_y", node.y)}
         for gate in self.GATES[self.cell]:
@@ -496,7 +575,7 @@ class Recurrent:
             i, f, o = (_sigmoid(self._gate(name, x, h)) for name in "ifo")
             c = f * c + i * np.tanh(self._gate("c", x, h))
             h = o * np.tanh(c)
-        return _act(self.weights["Z_y"] @ h + self.weights["b_y"], self._activation)[1], (h, c)
+        return self._act(self.weights["Z_y"] @ h + self.weights["b_y"])[1], (h, c)
 
     def _gate(self, name: str, x: np.ndarray, h: np.ndarray) -> np.ndarray:
         w = self.weights
@@ -517,7 +596,7 @@ class Controller:
             self.weights |= {name: node.claim(name, *shape) for name, shape in shapes.items()}
         outputs = {"Z_y": (node.y, h), "Z_r": (node.y, read), "b_y": (node.y,)}
         self.weights |= {name: node.claim(name, *shape) for name, shape in outputs.items()}
-        self._activation = node.config["output_activation"]
+        self._act = Output(node.config)
 
     def __call__(self, x: np.ndarray, state: Any) -> tuple[np.ndarray, Any]:
         """The output of its hidden layer, and its state."""
@@ -533,7 +612,7 @@ class Controller:
     def action(self, h: np.ndarray, read: np.ndarray) -> np.ndarray:
         """What the whole network does, given what was just read."""
         w = self.weights
-        return _act(w["Z_y"] @ h + w["Z_r"] @ read + w["b_y"], self._activation)[1]
+        return self._act(w["Z_y"] @ h + w["Z_r"] @ read + w["b_y"])[1]
 
 
 def _softmax(x: np.ndarray) -> np.ndarray:
@@ -814,6 +893,38 @@ class Normalized:
         return self._inner(np.clip((x - self._mean) / self._std, -10.0, 10.0), memory)
 
 
+class Choosing:
+    """`credo.networks.choosing`: what the network within says of each option, as how far that is
+    below the largest of its choice."""
+
+    BARRED: ClassVar[float] = -1e9
+
+    def __init__(self, node: Node):
+        parts = [_saying(part) for part in node.described["parts"]]
+        node = dataclasses.replace(node, described=node.described | {"parts": parts})
+        self._inner = node.part(0, "policy", node.x, node.y, node.agents)
+        self._ends, n = np.cumsum(node.config["choices"]), sum(node.config["choices"])
+        self._masked, self.start = node.config["masked"], self._inner.start
+        if not 0 < n <= (min(node.x, node.y) if self._masked else node.y):
+            raise ValueError(f"its choices are {node.config['choices']}: more than an action holds")
+
+    def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
+        u, memory = self._inner(x, memory)
+        n = self._ends[-1]
+        if self._masked:
+            barred = np.where(x[..., :n] > 0.5, u[..., :n], np.float32(self.BARRED))
+            u = np.concatenate([barred, u[..., n:]], axis=-1)
+        *parts, boxes = np.split(u, self._ends, axis=-1)
+        below = [part - part.max(axis=-1, keepdims=True) for part in parts]
+        return np.tanh(np.concatenate([*below, boxes], axis=-1)), memory
+
+
+def _saying(described: dict[str, Any]) -> dict[str, Any]:
+    """A network, and those within it, as ones whose action is what their output layer says."""
+    parts = [_saying(part) for part in described.get("parts", ())]
+    return described | {"config": described["config"] | {"said": True}, "parts": parts}
+
+
 NETWORKS: dict[str, tuple[Callable[[Node], Any], bool | None]] = {
     "MLP": (MLP, False),
     "MMU": (MMU, False),
@@ -825,6 +936,7 @@ NETWORKS: dict[str, tuple[Callable[[Node], Any], bool | None]] = {
     "DMMU": (DMMU, True),
     "Centralized": (Centralized, True),
     "Normalized": (Normalized, None),
+    "Choosing": (Choosing, None),
 }
 """By name in a file; and whether it acts for a team or, False, for one. None: as that within."""
 

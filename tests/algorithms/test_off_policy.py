@@ -27,6 +27,7 @@ from credo.learners.dqn import DQN
 from credo.learners.fitness_critic import Criticised, FitnessCritic
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3, ddpg
+from credo.networks.choosing import choosing
 from credo.networks.exploration import OrnsteinUhlenbeck
 from credo.networks.mlp import MLP, Critic
 from credo.networks.recurrent import Recurrent
@@ -201,25 +202,27 @@ def test_dqn_is_refused_where_there_is_nothing_to_choose():
         OffPolicy.dqn(Copy()).init(key=jax.random.key(0))
 
 
-@pytest.mark.parametrize("build", [OffPolicy.dqn, PPO.ppo, ERL.erl])
+@pytest.mark.parametrize("build", [lambda *x: OffPolicy(*x, DQN()), PPO])
 def test_outputs_that_saturate_are_refused_where_they_choose(build):
-    with pytest.raises(ValueError, match="give MLP output_activation='relative'"):
+    with pytest.raises(ValueError, match=r"give choosing\(task, MLP"):
         build(Choose(), MLP((4,))).init(key=jax.random.key(0))
 
 
-def test_outputs_of_a_choice_are_refused_where_actions_are_numbers():
-    relative = MLP((4,), output_activation="relative")
-    for build in (OffPolicy.td3, PPO.ppo, ERL.ea, Neuroevolution):
-        with pytest.raises(ValueError, match="'relative' and Copy has Box actions"):
-            build(Copy(), relative)
+def test_a_network_of_other_choices_is_refused():
+    for env in (Copy(), Choose(size=4)):
+        network = choosing(Choose(), MLP((4,)))
+        told = f"{type(env).__name__} has choices of .* and the network makes choices of .3"
+        for build in (OffPolicy.td3, PPO.ppo, ERL.ea, Neuroevolution):
+            with pytest.raises(ValueError, match=told):
+                build(env, network)
 
 
 def test_what_wraps_a_learner_learns_what_it_does():
     learner = Criticised(DQN(), FitnessCritic())
     with pytest.raises(ValueError, match="Copy has Box actions: Criticised cannot learn that"):
         OffPolicy(Copy(), MLP((4,)), learner).init(key=jax.random.key(0))
-    assert not learner.teams
-    assert Criticised().teams
+    assert learner.teams
+    assert not Criticised(SAC(), FitnessCritic()).teams
 
 
 def test_there_is_no_gradient_for_a_coach_through_a_choice():
@@ -231,7 +234,7 @@ def test_there_is_no_gradient_for_a_coach_through_a_choice():
 def test_the_last_action_is_told_as_a_choice(env):
     """Whatever numbers chose it: else a policy would see in tests what it never saw while it
     learned."""
-    network = MLP((4,), output_activation="relative")
+    network = MLP((4,))
     for build in (OffPolicy.dqn, PPO.ppo):
         algorithm = build(with_last_step(env), network, test_episodes=2, test_every=1)
         _, state = run(algorithm, 2, play=eager if env is CART else generation)
@@ -244,13 +247,13 @@ def test_the_last_action_is_told_as_a_choice(env):
 CHOOSING = {
     "dqn": lambda: OffPolicy.dqn(
         Choose(),
-        MLP((16,), "tanh", initializer="fan_in", output_activation="relative"),
+        MLP((16,), "tanh", initializer="fan_in"),
         learner=DQN(learning_rate=0.01, tau=0.1, gamma=0.5, exploration=100, batch_size=32),
         **SETTINGS | {"test_every": 100},
     ),
     "dqn with memory": lambda: OffPolicy.dqn(
         Choose(),
-        Recurrent("gru", 16, "relative", "fan_in"),
+        Recurrent("gru", 16, "tanh", "fan_in"),
         learner=DQN(learning_rate=0.01, tau=0.1, gamma=0.5, exploration=100, batch_size=64),
         sampling=Sampling(window=10, burn_in=0),
         updates_per_frame=0.5,
@@ -267,7 +270,7 @@ CHOOSING = {
     ),
     "ppo with memory": lambda: PPO.ppo(
         Choose(),
-        Recurrent("gru", 16, "relative", "fan_in"),
+        Recurrent("gru", 16, "tanh", "fan_in"),
         window=10,
         horizon=160,
         copies=16,
@@ -286,7 +289,7 @@ def test_it_learns_to_choose(name):
 
 
 def test_a_population_and_dqn_learn_to_choose_together():
-    network = MLP((8,), "tanh", initializer="fan_in", output_activation="relative")
+    network = MLP((8,), "tanh", initializer="fan_in")
     learner = DQN(learning_rate=0.01, tau=0.1, gamma=0.5, exploration=100, batch_size=32)
     settings = {"population_size": 4, "elite_fraction": 0.25, "sync_period": 1}
     algorithm = ERL.erl(

@@ -15,6 +15,7 @@ from credo.compilation import jit
 from credo.environments.passive_tmaze import PassiveTMaze
 from credo.environments.probes import Copy
 from credo.learners.base import act
+from credo.networks.choosing import Choosing
 from credo.networks.exploration import Categorical
 from credo.networks.mlp import MLP, Critic
 from credo.networks.recurrent import Recurrent
@@ -157,7 +158,7 @@ def test_the_entropy_of_a_gaussian_and_of_a_choice():
     actor = Actor(MLP((2,)).init(1, 2, key=jax.random.key(0)), jnp.log(jnp.array([0.5, 2.0])))
     expected = np.log(0.5) + np.log(2.0) + np.log(2 * np.pi * np.e)
     np.testing.assert_allclose(actor.entropy(jnp.zeros((3, 2))), expected, rtol=1e-6)
-    choice = Choice(actor.mean)
+    choice = Choice(Choosing(MLP((2,)), (3,)).init(1, 3, key=jax.random.key(0)))
     said = jnp.log(jnp.array([[0.5, 0.25, 0.25], [1 / 3, 1 / 3, 1 / 3]]))
     np.testing.assert_allclose(choice.entropy(said), [1.5 * np.log(2), np.log(3)], rtol=1e-6)
     taken = jnp.array([[-1.0, 1.0, -1.0], [1.0, -1.0, -1.0]])
@@ -166,7 +167,7 @@ def test_the_entropy_of_a_gaussian_and_of_a_choice():
 
 
 def test_actions_are_drawn_with_the_probabilities_of_the_softmax():
-    policy = MLP((), output_activation="relative").init(1, 3, key=jax.random.key(0))
+    policy = Choosing(MLP(()), (3,)).init(1, 3, key=jax.random.key(0))
     said = np.asarray(policy.spoken(jnp.ones(1), ())[1])
     explorer = Categorical(policy)
 

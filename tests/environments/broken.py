@@ -132,7 +132,7 @@ class Wide(Tiny):
 
 
 class Asks(Grid):
-    action_space = gymnasium.spaces.MultiBinary(3)
+    action_space = gymnasium.spaces.Text(3)
 
 
 class NoEnv:

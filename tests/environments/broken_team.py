@@ -85,8 +85,8 @@ class Watchful(Limited):
         return obs, dict.fromkeys(rewards, float("jax" in sys.modules)), *rest
 
 
-class Choosing(Limited):
-    actions = {"a": Discrete(3), "b": Discrete(3)}
+class Unlike(Limited):
+    actions = {"a": Discrete(3), "b": Box(-1, 1, (1,))}
 
 
 class Forgetful(Limited):
@@ -117,7 +117,7 @@ class Movable(Limited):
     def __init__(self, continuous_actions=False):
         super().__init__()
         if not continuous_actions:
-            self.actions = Choosing.actions
+            self.actions = {"a": Discrete(3), "b": Discrete(3)}
 
 
 def parallel_env(**kwargs):

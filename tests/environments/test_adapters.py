@@ -8,9 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from credo.algorithms.erl import ERL
 from credo.algorithms.off_policy import OffPolicy
-from credo.algorithms.ppo import PPO
 from credo.environments import checks, foreign
 from credo.environments.adapters import Single
 from credo.environments.foreign import close_all
@@ -122,26 +120,13 @@ def test_values_of_a_wrong_type_are_refused(said, told):
 @pytest.mark.parametrize("where", ["obs", "info"])
 def test_the_largest_entry_that_is_allowed_is_played(where):
     env = here("Masked", where=where)
-    assert env.obs_size == (5 if where == "obs" else 1)
+    assert (env.obs_size, env.choices, env.masked) == (5, (4,), True)
     copies, seen = first(env)
-    if where == "obs":
-        assert seen.tolist() == [1, 0, 0, 1, 0]  # the mask stays in the observation
+    assert seen.tolist() == [1, 0, 0, 1, 0]
     on, action = np.ones(1, bool), np.float32([[0.1, 0.9, 0.8, 0.3]])
     paid = [copies.step(action, on).rewards["reward"][0] for _ in range(4)]
     assert paid == [13.0, 11.0, 13.0, 11.0]
     assert action.tolist() == np.float32([[0.1, 0.9, 0.8, 0.3]]).tolist()
-
-
-@pytest.mark.parametrize("where", ["obs", "info"])
-def test_learners_are_refused_where_actions_are_forbidden(where):
-    """What they said would not be what was done."""
-    env = here("Masked", where=where)
-    assert env.masked
-    assert not here("Grid").masked
-    for build in (OffPolicy.dqn, PPO.ppo, ERL.erl):
-        with pytest.raises(ValueError, match=r"has an action_mask: \w+ cannot learn that\. Give"):
-            build(env).init(key=jax.random.key(0))
-    ERL.ea(env).init(key=jax.random.key(0))
 
 
 def test_a_mask_that_allows_nothing_is_a_fault_but_at_the_end():
@@ -198,7 +183,8 @@ def test_a_task_says_how_it_takes_actions():
         "obs_size": 6,
         "action_size": 3,
         "agents": None,
-        "discrete": True,
+        "choices": [3],
+        "masked": False,
         "actions": {"n": 3, "start": 5},
         "observations": None,
         "names": None,

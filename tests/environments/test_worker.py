@@ -361,7 +361,7 @@ def test_what_may_not_be_open_at_once_plays_in_turn():
 
 UNFIT = {
     "unbounded": (tiny("Unbounded"), "action space without bounds.*: give its Box a finite low"),
-    "other actions": (tiny("Asks"), r"action space MultiBinary\(3\): use a Box or a Discrete"),
+    "other actions": (tiny("Asks"), r"action space Text\(.*: use a Box, a Discrete, a Multi"),
     "no env": (tiny("NoEnv"), "is a NoEnv: name a class derived from gymnasium.Env"),
     "unknown id": (
         Gymnasium("Hoper-v5"),

@@ -9,13 +9,14 @@ import pytest
 
 from credo.compilation import jit
 from credo.learners.dqn import DQN, error
+from credo.networks.choosing import Choosing
 from credo.networks.exploration import EpsilonGreedy
 from credo.networks.graph import Graph
 from credo.networks.mlp import MLP
 from credo.types import Batch
 
 OBS, ACT, N = 3, 4, 6
-NETWORK = MLP(hidden=(5,), initializer="fan_in", output_activation="relative")
+NETWORK = Choosing(MLP(hidden=(5,), initializer="fan_in"), (ACT,))
 LEARNER = DQN(gamma=0.9, learning_rate=0.01, tau=0.25, batch_size=N)
 
 
@@ -25,7 +26,7 @@ def weights(policy):
 
 def said(policy, obs):
     """Q(s, ·) `[rows, act]` of an MLP, by hand."""
-    w = weights(policy)
+    w = weights(policy.policy)
     hidden = np.tanh(obs @ w["W_0"].T + w["b_0"])
     return hidden, hidden @ w["W_1"].T + w["b_1"]
 
@@ -142,9 +143,10 @@ def test_the_target_follows_and_the_actor_takes_the_largest(learned):
 def test_the_largest_is_found_among_large_values():
     """Behind tanh, 300 and 301 are both 1."""
     policy = NETWORK.init(OBS, ACT, key=jax.random.key(0))
-    w = {name: jnp.zeros_like(x) for name, x in policy.weights.items()}
+    w = {name: jnp.zeros_like(x) for name, x in policy.policy.weights.items()}
     w["b_1"] = jnp.array([300.0, 299.5, 301.0, -500.0])
-    action, _ = dataclasses.replace(policy, weights=w)(jnp.zeros(OBS), ())
+    inner = dataclasses.replace(policy.policy, weights=w)
+    action, _ = dataclasses.replace(policy, policy=inner)(jnp.zeros(OBS), ())
     assert int(action.argmax()) == 2
     assert float(action.max()) == 0.0
     assert (np.abs(action) <= 1).all()

@@ -16,6 +16,7 @@ from credo.environments.sequence_recall import SequenceRecall
 from credo.environments.simple_spread import SimpleSpread
 from credo.environments.wrappers import DelayedHostReward
 from credo.networks.base import ACTIVATIONS, AbstractNetwork, AbstractPolicy
+from credo.networks.choosing import Choosing
 from credo.networks.dmmu import DMMU
 from credo.networks.dnc import DNC
 from credo.networks.graph import Graph
@@ -53,12 +54,12 @@ NETWORKS = [
     DNC(hidden=4, rows=5, width=3, read_heads=2),
     DNC("feedforward", 4, 4, 3, 1, "tanh", "fan_in"),
 ]
-RELATIVE = [
-    MLP((4,), output_activation="relative"),
-    MMU(4, output_activation="relative"),
-    Recurrent("gru", 4, "relative"),
-    NTM(hidden=4, rows=5, width=3, output_activation="relative"),
-    DNC(hidden=4, rows=4, width=3, output_activation="relative"),
+TELLING = [
+    MLP((4,)),
+    MMU(4),
+    Recurrent("gru", 4),
+    NTM(hidden=4, rows=5, width=3),
+    DNC(hidden=4, rows=4, width=3),
 ]
 AGENTS = 3
 HEADS = (MLP((), initializer="uniform"), MMU(3), Recurrent("gru", 3), Recurrent("lstm", 3))
@@ -145,14 +146,37 @@ def test_the_runner_acts_as_the_champion_over_an_episode(tmp_path, network):
     np.testing.assert_array_equal(again, theirs)
 
 
-@pytest.mark.parametrize("network", RELATIVE, ids=str)
-def test_the_runner_chooses_as_the_champion(network):
-    champion = network.init(3, 3, key=jax.random.key(0))
-    policy, act = Policy(champion), loaded(champion, obs_size=3, action_size=3)
-    ours = np.array([policy(obs) for obs in observations()])
-    assert (ours.max(axis=1) == 0).all()
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("network", TELLING, ids=str)
+def test_the_runner_chooses_as_the_champion(network, masked):
+    """Two choices and a number; of a mask at least one option of each choice is allowed."""
+    network = Choosing(network, (3, 2), masked)
+    champion = network.init(7, 6, key=jax.random.key(0))
+    policy, act = Policy(champion), loaded(champion, obs_size=7, action_size=6)
+    seen = observations(size=7)
+    seen[:, :5] = np.abs(seen[:, :5]) > 0.5
+    seen[:, [1, 4]] = 1.0
+    ours = np.array([policy(obs) for obs in seen])
+    assert (ours[:, :3].max(axis=1) == 0).all()
+    assert (ours[:, 3:5].max(axis=1) == 0).all()
     assert ours.std(axis=0).max() > 1e-3
-    np.testing.assert_allclose([act(obs) for obs in observations()], ours, rtol=0, atol=1e-5)
+    barred = ours[:, :5][seen[:, :5] < 0.5]
+    assert barred.size > 20
+    assert (barred == -1.0).all() == masked
+    np.testing.assert_allclose([act(obs) for obs in seen], ours, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("sharing", ["trunk", "everything", "nothing"])
+def test_the_runner_chooses_as_a_team(sharing):
+    network = Choosing(Team((5,), MMU(3), sharing), (3,), masked=True)
+    champion = network.init(5, 3, AGENTS, key=jax.random.key(0))
+    policy, act = Policy(champion), loaded(champion, AGENTS, obs_size=5, action_size=3)
+    seen = fleet(size=5)
+    seen[..., :3] = seen[..., :3] > 0
+    seen[..., 1] = 1.0
+    ours = np.array([policy(obs) for obs in seen])
+    assert (ours[..., :3][seen[..., :3] < 0.5] == -1.0).all()
+    np.testing.assert_allclose([act(obs) for obs in seen], ours, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("network", TEAMS, ids=str)
@@ -248,7 +272,7 @@ def test_actions_are_those_that_the_worker_gives_the_environment(tmp_path, space
     own = Plant.spaces[space]
     run = made(tmp_path / "run", DelayedHostReward(plant(space)), MLP((5,)), action=own)
     raw, act = run.policy(raw=True), Runner.load(export(run, tmp_path / "p.safetensors"))
-    read = adapters._actions(own)[1]
+    read = adapters._actions(own).read
     expected = [read(raw(obs)[None])[0] for obs in observations()]
     actions, policy = [act(obs) for obs in observations()], run.policy()
     assert all(own.contains(action) for action in actions)
@@ -277,7 +301,7 @@ def test_the_file_says_what_it_is(tmp_path):
         assert sorted(file.keys()) == ["W_0", "W_1", "b_0", "b_1"]
         assert file.get_tensor("W_0").shape == (5, 3)
         description = json.loads(file.metadata()[DESCRIPTION])
-    assert description["version"] == 2
+    assert description["version"] == 3
     assert description["task"] == "test_export:Plant"
     assert description["network"]["type"] == "MLP"
     assert description["network"]["config"]["hidden"] == [5]

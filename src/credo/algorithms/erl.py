@@ -42,7 +42,7 @@ from ..learners.base import AbstractLearner, in_windows
 from ..learners.coach import AbstractCoach
 from ..learners.credit import AbstractRedistribution, Even
 from ..learners.decomposed import Decomposed
-from ..learners.dqn import DQN, choosing
+from ..learners.dqn import DQN
 from ..learners.horizon import AbstractHorizon, Truncated
 from ..learners.manager import UCB, AbstractManager
 from ..learners.sac import HYBRID_NETWORK, modern
@@ -50,6 +50,7 @@ from ..learners.share import AbstractShare, Earned
 from ..learners.surrogate import AbstractSurrogate
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, ddpg
 from ..networks.base import AbstractNetwork
+from ..networks.choosing import choosing
 from ..networks.mlp import MLP, Critic
 from ..networks.team import Team
 from ..replay import Sampling
@@ -141,7 +142,7 @@ class ERL(Hybrid):
         if overrides.get("learners", True):
             settings |= {"learners": (DQN() if env.discrete else ddpg(),)}
             settings = in_windows(env, network, settings)
-        network = network or (Team() if env.agents is not None else choosing(env, ERL_NETWORK))
+        network = choosing(env, network or (Team() if env.agents is not None else ERL_NETWORK))
         return cls(env, network, **evolving(BREEDER, settings, overrides))
 
     @classmethod
@@ -189,7 +190,7 @@ class ERL(Hybrid):
         settings = {"learners": learners, "workers": 10, "manager": UCB(), "elite_fraction": 0.2}
         settings |= {"sync_period": 5, "test_episodes": 10, "test_every": 5}
         settings = in_windows(env, network, settings)
-        network = network or choosing(env, TD3_NETWORK)
+        network = choosing(env, network or TD3_NETWORK)
         return cls(env, network, **evolving(BREEDER, settings, overrides))
 
     @classmethod

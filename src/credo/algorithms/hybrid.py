@@ -111,7 +111,7 @@ class Hybrid(eqx.Module):
         if self.horizon is not None and self.network.remembers:
             raise ValueError(
                 "a horizon asks the critic about the last step alone, and "
-                f"{type(self.network).__name__} has memory: give horizon=None"
+                f"{require.named(self.network)} has memory: give horizon=None"
             )
         if self.horizon is not None:
             self.horizon.check(self.reward, self.redistribute, self.learners)

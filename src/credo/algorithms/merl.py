@@ -6,6 +6,7 @@ each of several learners may optimise a signal of its own: a level of credit per
 
 Departures from the printed box:
 
+- Of discrete actions the learner is DQN, of each agent's own values.
 - On a task without a reward `local` the preset's learner maximises what evolution does.
 - Line 8 lets every team play with noise; as the text (7.3) and the author's code say, only the
   learner's team does.
@@ -40,11 +41,13 @@ from ..evolution.breeder import AbstractBreeder, evolving
 from ..learners.base import AbstractLearner, in_windows
 from ..learners.coach import AbstractCoach
 from ..learners.credit import AbstractRedistribution, Even
+from ..learners.dqn import DQN
 from ..learners.horizon import AbstractHorizon
 from ..learners.share import AbstractShare
 from ..learners.surrogate import AbstractSurrogate
 from ..learners.td3 import TD3, TEAM
 from ..networks.base import AbstractNetwork
+from ..networks.choosing import choosing
 from ..networks.team import Team
 from ..replay import Sampling
 from ..rollout import Environment
@@ -56,14 +59,17 @@ from .overlap import overlapped
 
 LOCAL = TD3(signal="local", **TEAM)
 """The learner of the team: one twin critic that all agents share (lines 2 and 16-21)."""
+CHOOSING = DQN(signal="local", gamma=LOCAL.gamma, exploration=2_000)
+"""The learner of a team with discrete actions: each agent's own values."""
 BREEDER = replace(ERL_BREEDER, elite_fraction=0.2, crossover_probability=0.1)
 
 
-def _local(env: Environment) -> TD3:
-    """`LOCAL`, or on a task without such a reward its twin for what evolution maximises, with a
-    warning."""
+def _local(env: Environment) -> TD3 | DQN:
+    """`LOCAL`, of discrete actions `CHOOSING`; or on a task without such a reward its twin for what
+    evolution maximises, with a warning."""
+    learner = CHOOSING if env.choices else LOCAL
     if "local" in env.signals:
-        return LOCAL
+        return learner
     several = len(env.signals) > 1
     told = f"; learners.0.signal names another of {', '.join(env.signals)}" if several else ""
     warnings.warn(
@@ -71,7 +77,7 @@ def _local(env: Environment) -> TD3:
         f"evolution does{told}",
         stacklevel=2,
     )
-    return replace(LOCAL, signal=None)
+    return replace(learner, signal=None)
 
 
 class MERL(Hybrid):
@@ -131,7 +137,7 @@ class MERL(Hybrid):
         if "learners" not in overrides:
             settings |= {"learners": (_local(env),)}
         settings = in_windows(env, network, settings)
-        return cls(env, network or Team(), **evolving(BREEDER, settings, overrides))
+        return cls(env, choosing(env, network or Team()), **evolving(BREEDER, settings, overrides))
 
     @classmethod
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:

@@ -19,10 +19,12 @@ from ..compilation import float32
 from ..learners.base import AbstractLearner, in_windows, learn, require_windows
 from ..learners.credit import AbstractRedistribution
 from ..learners.decomposed import Decomposed
-from ..learners.dqn import DQN, DQN_NETWORK, choosing
+from ..learners.discrete_sac import DiscreteSAC
+from ..learners.dqn import DQN, DQN_NETWORK
 from ..learners.sac import HYBRID_NETWORK, SAC, modern
 from ..learners.td3 import ERL_NETWORK, TD3, TD3_NETWORK, TEAM, ddpg, maddpg, matd3
 from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.choosing import choosing
 from ..networks.team import Team
 from ..normalization import Moments, behind, frozen, warmed, watched
 from ..replay import Replay, Sampling, extend
@@ -92,15 +94,20 @@ class OffPolicy(eqx.Module):
 
     @classmethod
     def sac(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """The constants of SAC's authors, with a learned temperature."""
-        settings = in_windows(env, network, {"learner": SAC(), "start_frames": 10_000})
-        return cls(env, network or TD3_NETWORK, **settings | overrides)
+        """The constants of SAC's authors, with a learned temperature; of discrete actions
+        `DiscreteSAC`."""
+        settings: dict[str, Any] = {"learner": SAC(), "start_frames": 10_000}
+        if env.choices:
+            settings = {"learner": DiscreteSAC(), "start_frames": 1_000}
+        network = network or (TD3_NETWORK if env.agents is None else Team())
+        return cls(env, choosing(env, network), **in_windows(env, network, settings) | overrides)
 
     @classmethod
     def dqn(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """Discrete actions: double Q-learning, with an update per frame."""
         settings = in_windows(env, network, {"learner": DQN(), "start_frames": 1_000})
-        return cls(env, network or choosing(env, DQN_NETWORK), **settings | overrides)
+        network = network or (DQN_NETWORK if env.agents is None else Team())
+        return cls(env, choosing(env, network), **settings | overrides)
 
     @classmethod
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:

@@ -8,6 +8,7 @@ silence. The
 clipped gradient, the first deviation and the tanh around the mean are not the paper's.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, Self
@@ -21,8 +22,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from .. import require, tree
 from ..compilation import float32, jit
 from ..learners.base import act, adam, adam_state, averaged, mean, windows_of
-from ..learners.dqn import choosing
 from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.choosing import choosing, chosen
 from ..networks.exploration import Categorical, Explorer, GaussianNoise
 from ..networks.history import HistoryCriticNetwork, remembering, through
 from ..networks.mlp import MLP, AbstractCriticNetwork, Critic
@@ -68,20 +69,28 @@ class Actor(eqx.Module):
 
 
 class Choice(eqx.Module):
-    """A distribution over discrete actions, softmax of what a policy says before its output
-    activation. Of an action the largest entry is the one that was taken."""
+    """A distribution over the options of each choice, softmax of what a policy says before its
+    output activation; choices are independent. Of an action the largest entry of each is the one
+    that was taken."""
 
-    mean: AbstractPolicy  # whose largest output is the likeliest action
+    mean: AbstractPolicy  # whose largest outputs are the likeliest options
 
     def log_density(
         self, said: Float[Array, "batch act"], action: Float[Array, "batch act"]
     ) -> Float[Array, " batch"]:
-        taken = jnp.argmax(action, axis=1, keepdims=True)
-        return jnp.take_along_axis(jax.nn.log_softmax(said, axis=1), taken, axis=1)[:, 0]
+        each = []
+        for part, done in zip(self._parts(said), self._parts(action), strict=True):
+            taken = jnp.argmax(done, axis=1, keepdims=True)
+            log_p = jax.nn.log_softmax(part, axis=1)
+            each.append(jnp.take_along_axis(log_p, taken, axis=1)[:, 0])
+        return functools.reduce(jnp.add, each)
 
     def entropy(self, said: Float[Array, "batch act"]) -> Float[Array, " batch"]:
-        log_p = jax.nn.log_softmax(said, axis=1)
-        return -jnp.sum(jnp.exp(log_p) * log_p, axis=1)
+        log_p = [jax.nn.log_softmax(part, axis=1) for part in self._parts(said)]
+        return functools.reduce(jnp.add, [-jnp.sum(jnp.exp(p) * p, axis=1) for p in log_p])
+
+    def _parts(self, x: Float[Array, "batch act"]) -> list[Float[Array, "batch options"]]:
+        return [part.T for part in chosen(self.mean).parts(x.T)]
 
     def says(self, policy: AbstractPolicy) -> Callable[..., Any]:
         def step(obs, carry):
@@ -188,7 +197,7 @@ class PPO(eqx.Module):
     def ppo(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of its authors for MuJoCo, and what the paper leaves open. For a network
         with memory minibatches hold 8 windows, of whole episodes where those are short."""
-        given: dict[str, Any] = {"network": network or choosing(env, NETWORK)}
+        given: dict[str, Any] = {"network": choosing(env, network or NETWORK)}
         if network is not None and network.remembers:
             window = windows_of(env).window
             given |= {"window": window, "batch_size": 8 * window}
@@ -203,7 +212,7 @@ class PPO(eqx.Module):
     def init(self, *, key: PRNGKeyArray) -> PPOState:
         """Fresh networks, and room for the frames of one generation."""
         env = self.env
-        if env.discrete:
+        if env.choices:
             require.choices(env, self.network, self)
         actor_key, critic_key = jax.random.split(key)
         mean = self.network.init(env.obs_size, env.action_size, key=actor_key)

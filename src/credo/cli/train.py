@@ -190,13 +190,16 @@ def _network(line: Line, name: str | None, algorithm: str, env: Any) -> Any:
     if ALGORITHMS[algorithm].get("gradient"):
         fields = fields | NETWORKS[name].get("gradient", {})
     network = load(NETWORKS[name]["path"])(**fields)
-    if env.discrete and not env.masked and hasattr(network, "output_activation"):
-        network = dataclasses.replace(network, output_activation="relative")
     if env.agents is not None and not network.team and algorithm != "ccea":
         from ..networks.team import Team
 
         network = Team(trunk=(), head=network, sharing="nothing")
-    return line.take(network, "network.")
+    network = line.take(network, "network.")
+    if algorithm == "ccea":
+        return network
+    from ..networks.choosing import choosing
+
+    return choosing(env, network)
 
 
 def _start(command: Train, algorithm: Any) -> None:

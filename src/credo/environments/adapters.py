@@ -9,7 +9,7 @@ import importlib
 import inspect
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
@@ -42,8 +42,9 @@ def _most_steps(limits: list[int | None], warnings: list[str]) -> int:
 class Single:
     """What all copies of a Gymnasium environment have in common, taken from the first.
 
-    Of a Discrete action the largest entry is taken: the largest that is allowed, where
-    `action_mask` of a Dict observation, or of `info`, says which are.
+    Of the options of a Discrete action the largest is taken: the largest that is allowed, where
+    `action_mask` of a Dict observation, or of `info`, says which are. Then observations begin with
+    that.
     """
 
     agents: ClassVar[int | None] = None
@@ -71,22 +72,20 @@ class Single:
     def __init__(self, env: gymnasium.Env, spec: dict[str, Any]):
         self.warnings = _lasting(env)
         self.max_steps = self._limit(env, spec["max_episode_steps"])
-        flat = _flat(env.observation_space)
+        acts = _actions(env.action_space)
+        self.action_size, self.choices, self._choose = acts.size, list(acts.choices), acts.read
+        self.actions = _described(env.action_space)
+        self._options, seen = sum(acts.choices), _shown_mask(env.observation_space)
+        self._seen = seen is not None and seen.shape == (self._options,)
+        self.masked = bool(acts.choices) and (self._seen or _masks(env))
+        flat = _flat(env.observation_space, first="action_mask" if self._seen else None)
+        if self.masked and not self._seen:
+            flat = flat.behind(self._options)
         self.obs_size, self._write, self.obs_dtype = flat.size, flat.write, flat.dtype
         self.obs_range = flat.bounds
         self.observations = _choice(env.observation_space)
-        self.action_size, self.read = _actions(env.action_space)
-        self.actions = _described(env.action_space)
-        self.discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
-        self.masked = False
         self.said: dict[int, Any] = {}  # by copy: its last observation, as it came
-        self._masks: dict[int, np.ndarray] = {}  # by copy: which actions it allows next
-        if self.discrete:
-            self._choose, self.read = self.read, self._allowed
-            spaces = getattr(env.observation_space, "spaces", {})
-            mask = spaces.get("action_mask") if isinstance(spaces, dict) else None
-            self._seen = mask is not None and mask.shape == (self.action_size,)
-            self.masked = self._seen or _masks(env)
+        self._masks: dict[int, np.ndarray] = {}  # by copy: which options it allows next
 
     def _limit(self, env: gymnasium.Env, limit: int | None) -> int:
         """Steps of an episode: the least of the user's limit and of every `TimeLimit` wrapper."""
@@ -103,8 +102,8 @@ class Single:
         _count(result, 2, "reset", "(observation, info)")
         self.said[i] = result[0]
         self._write(result[0], frame.obs[i])
-        if self.discrete:
-            self._allow(*result, i)
+        if self.choices:
+            self._allow(result[0], result[1], frame, i)
 
     def step(self, env: gymnasium.Env, action: Any, frame: Any, i: int) -> bool:
         """One step of copy `i`, written to its row; whether the episode is over."""
@@ -117,62 +116,82 @@ class Single:
         terminated, truncated = _flag("terminated", terminated), _flag("truncated", truncated)
         frame.terminated[i], frame.truncated[i] = terminated, truncated
         over = terminated or truncated
-        if self.discrete and not over:
-            self._allow(obs, info, i)
+        if self.choices:
+            self._allow(obs, info, frame, i, over)
         return over
 
-    def _allow(self, obs: Any, info: Any, i: int) -> None:
-        """Remember what copy `i` allows next, as far as it says."""
+    def _allow(self, obs: Any, info: Any, frame: Any, i: int, over: bool = False) -> None:
+        """Remember what copy `i` allows next, as far as it says, and tell it. Behind the end of an
+        episode it need not say anything."""
         says = obs if self._seen else info
-        mask = says.get("action_mask") if isinstance(says, dict) else None
-        if mask is None:
-            if self._masks:
-                self._masks.pop(i, None)
-            return
-        mask = np.asarray(mask)
-        if not self.masked:
+        told = says.get("action_mask") if isinstance(says, dict) else None
+        if told is not None and not self.masked:
             raise Fault(
                 "returned an action_mask in step and none in reset",
                 "give it in both, so that learners know that there is one",
             )
-        if mask.shape != (self.action_size,) or mask.dtype.kind not in "biu":
-            raise Fault(
-                f"returned an action_mask of shape {mask.shape} and dtype {mask.dtype}",
-                f"give one number, 0 or 1, for each of the {self.action_size} actions",
-            )
-        if not mask.any():
-            raise Fault("allows no action: its action_mask is 0 everywhere", "allow one, or end")
-        self._masks[i] = mask.astype(bool)
+        mask = None if told is None or over else _mask(told, self.choices)
+        self._masks.pop(i, None)
+        if mask is not None:
+            self._masks[i] = mask
+        if self.masked:
+            frame.obs[i, : self._options] = True if mask is None else mask
 
-    def _allowed(self, actions: np.ndarray) -> np.ndarray:
+    def read(self, actions: np.ndarray) -> Any:
         """The copies' own actions for `[n, act]`, of those that their masks allow."""
         if self._masks:
             actions = actions.copy()
             for i, mask in self._masks.items():
-                actions[i, ~mask] = -np.inf
+                actions[i, : self._options][~mask] = -np.inf
         return self._choose(actions)
 
 
-def _masks(env: gymnasium.Env) -> bool:
-    """Whether an environment says in `info` which actions it allows: it is asked once. One that
-    cannot be reset fails again, and is heard, when it is played."""
+def _mask(told: Any, choices: Sequence[int]) -> np.ndarray:
+    """An `action_mask` as one row of truth values, an option each. Several choices may have theirs
+    in a tuple, as Gymnasium samples by them."""
+    mask = np.concatenate(told) if isinstance(told, tuple) else np.asarray(told)
+    if mask.shape != (sum(choices),) or mask.dtype.kind not in "biu":
+        options = f"{choices[0]} actions" if len(choices) == 1 else f"{sum(choices)} options"
+        raise Fault(
+            f"returned an action_mask of shape {mask.shape} and dtype {mask.dtype}",
+            f"give one number, 0 or 1, for each of the {options}",
+        )
+    mask = mask.astype(bool)
+    if not all(part.any() for part in np.split(mask, np.cumsum(choices)[:-1])):
+        part = "" if len(choices) == 1 else " for one of its choices"
+        raise Fault(f"allows no action: its action_mask is 0 everywhere{part}", "allow one, or end")
+    return mask
+
+
+def _shown_mask(space: Any) -> Any:
+    """The space of `action_mask` in a Dict of observations; None if there is none."""
+    spaces = getattr(space, "spaces", {})
+    return spaces.get("action_mask") if isinstance(spaces, dict) else None
+
+
+def _masks(env: Any) -> bool:
+    """Whether an environment says in `info`, or in that of an agent, which actions it allows: it is
+    asked once. One that cannot be reset fails again, and is heard, when it is played."""
     try:
         said = env.reset(seed=0)
     except Exception:
         return False
     info = said[1] if isinstance(said, tuple) and len(said) == 2 else None
-    return isinstance(info, dict) and "action_mask" in info
+    if not isinstance(info, Mapping):
+        return False
+    return any(isinstance(x, Mapping) and "action_mask" in x for x in (info, *info.values()))
 
 
 class Team:
     """What all copies of a `ParallelEnv` have in common, taken from the first.
 
     Agents keep the order of `possible_agents`. Observations are padded with zeros to the largest,
-    and of an action each agent is given as much as its own Box holds. The rewards' names are
-    looked up in one step of the first copy (`_Pay`).
+    and of an action each agent is given as much as its own space holds. All have Boxes, or all
+    choices, whose observations begin with what is allowed if agents have an `action_mask`, in a
+    Dict observation or in `info`, or not all the same options. The rewards' names are looked up in
+    one step of the first copy (`_Pay`).
     """
 
-    discrete = masked = False
     observations: ClassVar[None] = None
 
     @staticmethod
@@ -200,33 +219,60 @@ class Team:
             raise Fault("has no possible_agents", "name there every agent that an episode may have")
         self.agents = len(self.names)
         self._rows = {name: k for k, name in enumerate(self.names)}
-        for name in self.names:
-            _box(name, env.action_space(name))
-        flats = [_flat(env.observation_space(name)) for name in self.names]
-        actions = [_actions(env.action_space(name)) for name in self.names]
-        self.actions = [_described(env.action_space(name)) for name in self.names]
+        self._learn_actions(env)
+        spaces = [env.observation_space(name) for name in self.names]
+        self._seen = [_shown_mask(space) is not None for space in spaces]
+        self.masked = self._uneven or any(self._seen) or (bool(self.choices) and _masks(env))
+        flats = [self._flat(space, seen) for space, seen in zip(spaces, self._seen, strict=True)]
         self.obs_size = max(flat.size for flat in flats)
         self.obs_dtype = "uint8" if all(x.dtype == "uint8" for x in flats) else "float32"
         self.obs_range = [_padded(flat, self.obs_size) for flat in flats]
-        self.action_size = max(size for size, _ in actions)
         self.said: dict[int, Any] = {}  # by copy: its last observations, as they came
         self._writes = [(flat.size, flat.write) for flat in flats]
-        self._actions = actions
+        self._masks: dict[tuple[int, int], np.ndarray] = {}  # by copy and agent: what it may do
         self._owing: dict[int, set[str]] = {}  # by copy: who was there and has not terminated
         self._pay = _Pay(self._rows, spec)
         self._pay.learn(env, *self._first_step(env))
         self.signals = self._pay.signals
+
+    def _learn_actions(self, env: Any) -> None:
+        """Each agent's actions, and the choices that all of them are told by."""
+        spaces = [env.action_space(name) for name in self.names]
+        self._acts = [_actions(space) for space in spaces]
+        self.actions = [_described(space) for space in spaces]
+        self.action_size = max(acts.size for acts in self._acts)
+        kinds = {acts.choices for acts in self._acts}
+        self._uneven = len(kinds) > 1
+        alone = all(
+            acts.size == sum(acts.choices) and len(acts.choices) == 1 for acts in self._acts
+        )
+        if self._uneven and not alone:
+            raise Fault(
+                f"has the action spaces {', '.join(sorted({str(space) for space in spaces}))}",
+                "a team needs Boxes, or a Discrete for each agent, or the same choices for all: "
+                "wrap it in an environment that has them",
+            )
+        self.choices = [max(sum(kind) for kind in kinds)] if alone else list(kinds.pop())
+
+    def _flat(self, space: Any, seen: bool) -> "_Flat":
+        """An agent's observations, behind what it may do if there is such a thing."""
+        flat = _flat(_without_mask(space) if seen else space)
+        return flat.behind(sum(self.choices)) if self.masked else flat
 
     def _cycles(self, env: Any, limit: int | None) -> int:
         """PettingZoo has no wrapper for time limits; `max_cycles` is its custom."""
         return _most_steps([limit, getattr(env.unwrapped, "max_cycles", None)], self.warnings)
 
     def _first_step(self, env: Any) -> tuple[list[str], Any, Any]:
-        """Who acted in a first step with the middle of every Box, their rewards and infos."""
-        _count(env.reset(seed=0), 2, "reset", "(observations, infos)")
+        """Who acted in a first step with the middle of every Box, or the first options that are
+        allowed, their rewards and infos."""
+        first = env.reset(seed=0)
+        _count(first, 2, "reset", "(observations, infos)")
         acted = self._here(env)
         if not acted:
             return [], {}, {}
+        if self.choices:
+            self._remember(first[0], first[1], acted, 0)
         middle = self.read(np.zeros((1, self.agents, self.action_size), np.float32))[0]
         result = env.step({name: middle[self._rows[name]] for name in acted})
         _count(result, 5, "step", TEAM_STEP)
@@ -234,7 +280,11 @@ class Team:
 
     def read(self, actions: np.ndarray) -> list[tuple[np.ndarray, ...]]:
         """Actions `[n, agents, act]` in [-1, 1] as each copy's, agent by agent."""
-        own = [read(actions[:, k, :size]) for k, (size, read) in enumerate(self._actions)]
+        if self._masks:
+            actions = actions.copy()
+            for (i, k), mask in self._masks.items():
+                actions[i, k, : mask.size][~mask] = -np.inf
+        own = [acts.read(actions[:, k, : acts.size]) for k, acts in enumerate(self._acts)]
         return list(zip(*own, strict=True))
 
     def reset(self, env: Any, seed: int, frame: Any, i: int) -> None:
@@ -243,6 +293,7 @@ class Team:
         here = self._here(env)
         self.said[i] = result[0]
         self._write(result[0], here, frame, i)
+        self._allow(result[0], result[1], here, frame, i)
         self._owing[i] = set(here)
 
     def step(self, env: Any, action: Any, frame: Any, i: int) -> bool:
@@ -265,6 +316,7 @@ class Team:
         # Who leaves may say a last word: the observation that a learner bootstraps from.
         self.said[i] = obs
         self._write(obs, [*here, *(name for name in left if name in obs)], frame, i)
+        self._allow(obs, infos, here, frame, i)
         frame.active[i, [self._rows[name] for name in here]] = True
         frame.terminated[i] = not here and not owing
         frame.truncated[i] = not here and bool(owing)
@@ -282,7 +334,49 @@ class Team:
         for name in names:
             k = self._rows[name]
             size, write = self._writes[k]
-            write(_said("observation", obs, name), frame.obs[i, k, :size])
+            said = _said("observation", obs, name)
+            if self._seen[k]:
+                said = _behind_mask(said)
+            write(said, frame.obs[i, k, :size])
+
+    def _allow(self, obs: Any, infos: Any, here: list[str], frame: Any, i: int) -> None:
+        """Remember what the agents of copy `i` may do next, and tell them. Who is not there may do
+        anything."""
+        if self.choices:
+            self._remember(obs, infos, here, i)
+        if self.masked:
+            for k, acts in enumerate(self._acts):
+                options = self._masks.get((i, k), np.ones(sum(acts.choices), bool))
+                frame.obs[i, k, : sum(self.choices)] = 0
+                frame.obs[i, k, : options.size] = options
+
+    def _remember(self, obs: Any, infos: Any, here: list[str], i: int) -> None:
+        """What the agents of copy `i` may do next."""
+        for name, k in self._rows.items():
+            self._masks.pop((i, k), None)
+            says = obs.get(name) if self._seen[k] else infos.get(name)
+            told = says.get("action_mask") if isinstance(says, Mapping) else None
+            if told is not None and not self.masked:
+                raise Fault(
+                    "returned an action_mask in step and none in reset",
+                    "give it in both, so that learners know that there is one",
+                )
+            if told is not None and name in here:
+                self._masks[i, k] = _mask(told, self._acts[k].choices)
+
+
+def _without_mask(space: Any) -> gymnasium.Space:
+    """What a Dict of observations has beside `action_mask`: that alone, if it is one thing."""
+    rest = {key: part for key, part in space.spaces.items() if key != "action_mask"}
+    return next(iter(rest.values())) if len(rest) == 1 else gymnasium.spaces.Dict(rest)
+
+
+def _behind_mask(said: Any) -> Any:
+    """Of an observation what `_without_mask` has of its space."""
+    if not isinstance(said, Mapping):
+        raise Fault(f"returned an observation of type {type(said).__name__}", "return a dict")
+    rest = {key: part for key, part in said.items() if key != "action_mask"}
+    return next(iter(rest.values())) if len(rest) == 1 else rest
 
 
 TEAM_STEP = "(observations, rewards, terminations, truncations, infos)"
@@ -426,16 +520,6 @@ def _said(what: str, said: Any, name: str) -> Any:
     return said[name]
 
 
-def _box(name: str, space: gymnasium.Space) -> None:
-    """Raise `Fault` unless the action space of an agent is a Box."""
-    if not isinstance(space, gymnasium.spaces.Box):
-        raise Fault(
-            f"has the action space {space} for {name!r}",
-            "a team needs Box actions: ask for continuous ones in kwargs (continuous_actions=True "
-            "of mpe2, continuous=True of others), or wrap it in an environment that has them",
-        )
-
-
 def _registered(id: str, kwargs: dict[str, Any], max_episode_steps: int | None) -> gymnasium.Env:
     """One environment of an id in Gymnasium's registry; the module of its class is imported first,
     so that MuJoCo is there to be heard."""
@@ -500,10 +584,18 @@ class _Flat(NamedTuple):
         """The least and the largest of each number; one number where all are the same."""
         return [x[0] if x.size and (x == x[0]).all() else x.tolist() for x in self[2:4]]
 
+    def behind(self, n: int) -> "_Flat":
+        """The same row behind n numbers, from 0 to 1, that others write."""
+        low, high = np.append(np.zeros(n), self.low), np.append(np.ones(n), self.high)
+        return _Flat(
+            n + self.size, self.dtype, low, high, lambda obs, row: self.write(obs, row[n:])
+        )
 
-def _flat(space: gymnasium.Space, said: str = "an observation") -> _Flat:
-    """How observations of `space` become a row. `said` names them in a `Fault`, which is raised of
-    a space that NumPy cannot hold (Graph, Sequence)."""
+
+def _flat(space: gymnasium.Space, said: str = "an observation", first: str | None = None) -> _Flat:
+    """How observations of `space` become a row; of a Dict that with the part `first` in front.
+    `said` names them in a `Fault`, which is raised of a space that NumPy cannot hold (Graph,
+    Sequence)."""
     spaces = gymnasium.spaces
     if not (isinstance(space, gymnasium.Space) and space.is_np_flattenable):
         raise Fault(
@@ -516,7 +608,10 @@ def _flat(space: gymnasium.Space, said: str = "an observation") -> _Flat:
         write = _box_writer(space, said)
         return _Flat(low.size, "uint8" if small else "float32", low, high, write)
     if isinstance(space, spaces.Dict):
-        return _joined(space, dict(space.spaces), Mapping, said)
+        parts = dict(space.spaces)
+        if first is not None:
+            parts = {first: parts[first]} | parts
+        return _joined(space, parts, Mapping, said)
     if isinstance(space, spaces.Tuple):
         return _joined(space, dict(enumerate(space.spaces)), (tuple, list), said)
 
@@ -609,24 +704,107 @@ def _choice(space: gymnasium.Space) -> dict[str, int] | None:
     return {"n": int(space.n), "start": int(space.start)}
 
 
-def _described(space: gymnasium.Space) -> dict[str, Any]:
-    """An action space as JSON."""
-    if not isinstance(space, gymnasium.spaces.Box):
+def _described(space: Any) -> dict[str, Any]:
+    """An action space as JSON, for `credo.runner`."""
+    spaces = gymnasium.spaces
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = [[key, _described(part)] for key, part in _parts(space)]
+        return {"parts": parts, "dict": isinstance(space, spaces.Dict)}
+    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
+        form = {"shape": list(space.shape), "dtype": str(space.dtype)}
+        nvec, start = (x.ravel().tolist() for x in _vector(space))
+        return {"nvec": nvec, "start": start, **form}
+    if not isinstance(space, spaces.Box):
         return _choice(space) or {}
     low, high = (np.float64(bound).ravel().tolist() for bound in (space.low, space.high))
     return {"low": low, "high": high, "shape": list(space.shape), "dtype": str(space.dtype)}
 
 
-def _actions(space: gymnasium.Space) -> tuple[int, Callable[[np.ndarray], np.ndarray]]:
-    """Size of an action, and how to turn actions `[n, act]` in [-1, 1] into the space's own.
+def _parts(space: Any) -> list[tuple[Any, gymnasium.Space]]:
+    """Those of a Dict or a Tuple."""
+    spaces = space.spaces
+    return list(spaces.items() if isinstance(spaces, Mapping) else enumerate(spaces))
 
-    Box: -1 is its low, 1 its high. Discrete: the entry that is largest.
-    """
+
+def _vector(space: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Options of each choice of a MultiDiscrete or a MultiBinary, and the first option of each."""
+    if isinstance(space, gymnasium.spaces.MultiDiscrete):
+        return np.asarray(space.nvec), np.asarray(space.start)
+    return np.full(space.shape, 2), np.zeros(space.shape, space.dtype)
+
+
+class _Acts(NamedTuple):
+    """An action space as numbers in [-1, 1]: those of its choices, one for each option, and behind
+    them those of its Boxes."""
+
+    size: int
+    choices: tuple[int, ...]  # options of each
+    read: Callable[[np.ndarray], Any]  # actions [n, act] as the space's own, one by one
+
+
+def _actions(space: gymnasium.Space) -> _Acts:
+    """How actions are told. Box: -1 is its low, 1 its high. Discrete, MultiDiscrete, MultiBinary:
+    of each choice the entry that is largest. Dict, Tuple: those of its parts."""
+    choices = tuple(_options(space))
+    cursor = [0, sum(choices)]  # where the next choice begins, and the next Box
+    read = _reader(space, cursor)
+    return _Acts(cursor[1], choices, read)
+
+
+def _options(space: Any) -> list[int]:
+    """Options of each choice in a space, in order. Raises `Fault` of a space that has others."""
+    spaces = gymnasium.spaces
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        return [n for _, part in _parts(space) for n in _options(part)]
+    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
+        return [int(n) for n in _vector(space)[0].ravel()]
+    if isinstance(space, spaces.Discrete):
+        return [int(space.n)]
+    if isinstance(space, spaces.Box):
+        return []
+    raise Fault(
+        f"has the action space {space}",
+        "use a Box, a Discrete, a MultiDiscrete, a MultiBinary, or a Dict or Tuple of them",
+    )
+
+
+def _reader(space: Any, cursor: list[int]) -> Callable[[np.ndarray], Any]:
+    """What reads actions of a space from numbers at `cursor`, which is moved on."""
+    spaces = gymnasium.spaces
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        keys, parts = zip(*_parts(space), strict=True)
+        readers = [_reader(part, cursor) for part in parts]
+        made = dict if isinstance(space, spaces.Dict) else lambda pairs: tuple(x for _, x in pairs)
+        return lambda actions: [
+            made(zip(keys, own, strict=True))
+            for own in zip(*(read(actions) for read in readers), strict=True)
+        ]
+    if isinstance(space, spaces.Box):
+        return _scaled(space, cursor)
+    return _chosen(space, cursor)
+
+
+def _chosen(space: Any, cursor: list[int]) -> Callable[[np.ndarray], np.ndarray]:
+    """Of a Discrete, a MultiDiscrete or a MultiBinary."""
+    sizes, start = _options(space), cursor[0]
+    cursor[0] += sum(sizes)
     if isinstance(space, gymnasium.spaces.Discrete):
-        start = space.start
-        return int(space.n), lambda actions: np.argmax(actions, axis=1) + start
-    if not isinstance(space, gymnasium.spaces.Box):
-        raise Fault(f"has the action space {space}", "use a Box or a Discrete")
+        first, end = space.start, cursor[0]
+        return lambda actions: np.argmax(actions[:, start:end], axis=1) + first
+    ends, firsts = np.cumsum(sizes) + start, _vector(space)[1]
+
+    def read(actions: np.ndarray) -> np.ndarray:
+        each = [
+            np.argmax(actions[:, end - n : end], axis=1) for end, n in zip(ends, sizes, strict=True)
+        ]
+        own = np.stack(each, axis=1).reshape(-1, *space.shape) + firsts
+        return own.astype(space.dtype)
+
+    return read
+
+
+def _scaled(space: Any, cursor: list[int]) -> Callable[[np.ndarray], np.ndarray]:
+    """Of a Box."""
     low, high = (np.float64(bound).ravel() for bound in (space.low, space.high))
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise Fault(
@@ -635,14 +813,15 @@ def _actions(space: gymnasium.Space) -> tuple[int, Callable[[np.ndarray], np.nda
         )
     center, half = (low + high) / 2, (high - low) / 2
     shape, dtype = space.shape, space.dtype
-    whole = not np.issubdtype(dtype, np.floating)
+    whole, at, end = not np.issubdtype(dtype, np.floating), cursor[1], cursor[1] + low.size
+    cursor[1] = end
 
     def read(actions: np.ndarray) -> np.ndarray:
-        own = np.minimum(np.maximum(center + half * actions, low), high)
+        own = np.minimum(np.maximum(center + half * actions[:, at:end], low), high)
         own = np.rint(own) if whole else own
         return own.astype(dtype).reshape(-1, *shape)
 
-    return low.size, read
+    return read
 
 
 def _count(result: Any, n: int, where: str, parts: str) -> None:

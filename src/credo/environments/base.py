@@ -31,8 +31,12 @@ class AbstractTask(eqx.Module):
         """Names of the rewards. The first is what training maximises, unless an algorithm says
         otherwise; the last is what is reported, unless the task does."""
     agents: ClassVar[int | None] = None
-    discrete: ClassVar[bool] = False  # the largest of an action's entries is taken
-    masked: ClassVar[bool] = False  # and not every action is allowed at every step
+    choices: ClassVar[tuple[int, ...]] = ()
+    """Options of each choice that an action makes. Its first entries are one for every option, of
+    which the largest of each choice is taken; behind them are numbers in [-1, 1]."""
+    masked: ClassVar[bool] = False
+    """Whether an observation begins with a number for each option: 1 if it is allowed now, else 0.
+    Of those that are not the task takes none."""
     obs_range: ClassVar[tuple[Any, Any]] = (-math.inf, math.inf)
     """The least and the largest number in an observation."""
 
@@ -55,6 +59,16 @@ class AbstractTask(eqx.Module):
         """How a page draws its episodes; None: it does not. A task that draws its state in
         `render(state) -> [height, width, 3]` can be filmed as well."""
         return None
+
+    @property
+    def discrete(self) -> bool:
+        """Whether an action is choices alone."""
+        return bool(self.choices) and sum(self.choices) == self.action_size
+
+    @property
+    def barrable(self) -> int:
+        """Numbers at the start of an observation that say what is allowed; 0 if all always is."""
+        return sum(self.choices) if self.masked else 0
 
     @property
     def sizes(self) -> tuple[int, ...]:

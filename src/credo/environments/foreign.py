@@ -87,7 +87,11 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
     max_steps = _size("max_steps")
     obs_dtype = _size("obs_dtype")
     agents = _size("agents")
-    discrete = _size("discrete")
+
+    @property
+    def choices(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return tuple(self._sizes()["choices"])
+
     masked = _size("masked")
 
     def spec(self) -> dict[str, Any]:
@@ -426,7 +430,16 @@ def _form(x: np.ndarray, shape: tuple[int, ...], dtype: type) -> np.ndarray:
     return x
 
 
-RECORDED = ("obs_size", "action_size", "agents", "discrete", "actions", "observations", "names")
+RECORDED = (
+    "obs_size",
+    "action_size",
+    "agents",
+    "choices",
+    "masked",
+    "actions",
+    "observations",
+    "names",
+)
 _WARNED: set[str] = set()
 
 

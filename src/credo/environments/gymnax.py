@@ -88,8 +88,9 @@ class Gymnax(AbstractEnvironment):
         return _size(self._env.action_space(self._params))
 
     @property
-    def discrete(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return isinstance(self._env.action_space(self._params), spaces.Discrete)
+    def choices(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        space = self._env.action_space(self._params)
+        return (int(space.n),) if isinstance(space, spaces.Discrete) else ()
 
     @property
     def max_steps(self) -> int:
@@ -116,7 +117,7 @@ class Gymnax(AbstractEnvironment):
     def _own(self, action: Float[Array, " act"]) -> Any:
         """An action as the environment takes it."""
         space = self._env.action_space(self._params)
-        if self.discrete:
+        if self.choices:
             return jnp.argmax(action).astype(space.dtype)
         low, high = (np.broadcast_to(x, space.shape) for x in (space.low, space.high))
         return low + (action.reshape(space.shape) + 1.0) / 2.0 * (high - low)

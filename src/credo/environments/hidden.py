@@ -78,6 +78,11 @@ class Hiding(eqx.Module):
         n = self.env.obs_size
         if not self.entries or not 0 <= min(self.entries) <= max(self.entries) < n:
             raise ValueError(f"hides entries {self.entries}: there are 0 … {n - 1}")
+        if min(self.entries) < self.env.barrable:
+            raise ValueError(
+                f"hides entries {self.entries}: the first {self.env.barrable} say which actions "
+                "are allowed, and a policy has to know"
+            )
         if len(self.entries) == n:
             raise ValueError(f"hides all {n} entries of an observation: leave one or more")
 

@@ -178,9 +178,9 @@ class AbstractHostEnvironment(AbstractTask):
     def task_record(self) -> dict[str, Any]:
         """What a run records of its task; `actions`: how the task itself takes an action, None
         for numbers in [-1, 1] as they are."""
-        agents = {"agents": self.agents, "discrete": self.discrete}
-        sizes = {"obs_size": self.obs_size, "action_size": self.action_size}
-        return {**sizes, **agents, "actions": None, "observations": None}
+        names = ("obs_size", "action_size", "agents", "choices", "masked")
+        sizes = {name: getattr(self, name) for name in names}
+        return {**sizes, "actions": None, "observations": None}
 
     @abc.abstractmethod
     def copies(self, n: int) -> AbstractCopies:

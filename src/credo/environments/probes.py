@@ -93,14 +93,16 @@ class Choose(AbstractAnswer):
     observation has its 1. Best return `max_steps`; by chance one `size`-th of it."""
 
     obs_range: ClassVar[tuple[float, float]] = (0.0, 1.0)
-    discrete: ClassVar[bool] = True
-
     size: int = eqx.field(static=True, default=3)  # actions, at least 2
     max_steps: int = eqx.field(static=True, default=10)  # length of every episode, at least 1
 
     def __check_init__(self):
         require.at_least("size", self.size, 2)
         require.at_least("max_steps", self.max_steps, 1)
+
+    @property
+    def choices(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return (self.size,)
 
     def drawn(self, key):
         return jax.nn.one_hot(jax.random.randint(key, (), 0, self.size), self.size)

@@ -34,7 +34,7 @@ SIZES = (
     "obs_dtype",
     "action_size",
     "max_steps",
-    "discrete",
+    "choices",
     "masked",
     "agents",
     "signals",

@@ -108,7 +108,7 @@ class AbstractWrapper(AbstractEnvironment):
     agents = _of("env", "agents")
     reported = _of("env", "reported")
     unwrapped = _of("env", "unwrapped")
-    discrete = _of("env", "discrete")
+    choices = _of("env", "choices")
     masked = _of("env", "masked")
 
     def bare(self, state: PyTree) -> PyTree:
@@ -134,7 +134,7 @@ class NoisyObservations(AbstractWrapper):
     agent and step. What happens in the world is not noisy.
 
     Named as future work of the server fleet by Khadka (2019), section 4.2.5. Its status must stay
-    readable: `NoisyObservations(ServerFleet(), 0.5, spared=1)`.
+    readable: `NoisyObservations(ServerFleet(), 0.5, spared=1)`. What is allowed is told exactly.
     """
 
     std: float  # at least 0; one number for all entries, in the units of each
@@ -162,7 +162,8 @@ class NoisyObservations(AbstractWrapper):
         return state, self._told(now, key=noise_key)
 
     def _told(self, now: TimeStep, *, key: PRNGKeyArray) -> TimeStep:
-        noisy = jnp.arange(self.obs_size) < self.obs_size - self.spared
+        entry = jnp.arange(self.obs_size)
+        noisy = (entry >= self.barrable) & (entry < self.obs_size - self.spared)
         noise = self.std * jax.random.normal(key, now.obs.shape)
         obs = now.obs + jnp.where(noisy, noise, 0.0)
         return dataclasses.replace(now, obs=obs)
@@ -221,7 +222,7 @@ class AbstractHostWrapper(AbstractHostEnvironment):
     agents = _of("env", "agents")
     reported = _of("env", "reported")
     unwrapped = _of("env", "unwrapped")
-    discrete = _of("env", "discrete")
+    choices = _of("env", "choices")
     masked = _of("env", "masked")
     reward_shapes = _of("env", "reward_shapes")
     obs_dtype = _of("env", "obs_dtype")

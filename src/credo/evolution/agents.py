@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .. import require, tree
 from ..networks.base import AbstractNetwork
+from ..networks.choosing import Choosing
 from ..networks.dmmu import DMMU
 from ..networks.team import Team
 from .crossover import AbstractCrossover
@@ -77,6 +78,7 @@ def members(team: PyTree) -> tuple[PyTree, ...]:
 
 def apart(network: AbstractNetwork) -> bool:
     """Whether each agent of a team has weights of its own."""
+    network = network.network if isinstance(network, Choosing) else network
     return isinstance(network, DMMU) or (isinstance(network, Team) and network.sharing == "nothing")
 
 

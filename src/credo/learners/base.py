@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from .. import require
 from ..compilation import jit
 from ..environments.base import AbstractTask
-from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.base import AbstractNetwork, AbstractPolicy, features_first
 from ..networks.history import by_row, unrolled
 from ..networks.history import moments as seen_in
 from ..normalization import seen
@@ -40,7 +41,7 @@ class AbstractLearner(eqx.Module):
     reward_scale: eqx.AbstractVar[float | None]  # factor of rewards; None: it follows the buffer
     metrics: eqx.AbstractClassVar[tuple[str, ...]]  # names of what `update` reports
     teams: ClassVar[bool] = False  # whether it learns for all agents of a team
-    discrete: ClassVar[bool] = False  # whether it learns discrete actions, and no others
+    discrete: ClassVar[bool] = False  # whether it learns a choice, and no other actions
 
     @abc.abstractmethod
     def init(self, network: AbstractNetwork, *sizes: int, key: PRNGKeyArray) -> PyTree:
@@ -232,12 +233,13 @@ def act(policy: AbstractPolicy, obs: Float[Array, "batch *agents obs"]) -> Array
 
 
 def spoken(
-    policy: AbstractPolicy, batch: Batch, later: bool = False
-) -> tuple[Float[Array, "units batch"], Float[Array, "act batch"]]:
+    policy: AbstractPolicy, batch: Batch, later: bool = False, stored: bool = True
+) -> tuple[Float[Array, "units batch *agents"], Float[Array, "act batch *agents"]]:
     """What a policy's output layer is given, and says before its activation, in the rows of a batch
-    or after them."""
-    if batch.windows is None:
-        features, said, _ = policy.spoken((batch.next_obs if later else batch.obs).T, ())
+    or after them. `stored` as of `unrolled`."""
+    obs = batch.next_obs if later else batch.obs
+    if batch.windows is None and policy.features_first:
+        features, said, _ = policy.spoken(obs.T, ())
         return features, said
 
     def step(policy: AbstractPolicy):
@@ -247,21 +249,36 @@ def spoken(
 
         return parts
 
-    told = unrolled(policy, seen_in(batch, later), batch.windows, said=step)
-    features, said = (by_row(x, later).T for x in told)
+    if batch.windows is None:
+        start = policy.start(key=jax.random.key(0))
+        told = jax.vmap(lambda x: step(policy)(x, start)[0])(obs)
+    else:
+        told = unrolled(policy, seen_in(batch, later), batch.windows, stored, said=step)
+        told = tuple(by_row(x, later) for x in told)
+    features, said = map(features_first, told)
     return features, said
 
 
-def output_layer(network: AbstractNetwork, policy: AbstractPolicy, obs_size: int, who: str) -> int:
+def valued(
+    q: Float[Array, "act batch *agents"], action: Float[Array, "batch *agents act"]
+) -> Value:
+    """Of the values of all actions those of some, of which the largest entry is what is taken."""
+    taken = jnp.argmax(features_first(action), axis=0)[None]
+    return jnp.take_along_axis(q, taken, axis=0)[0]
+
+
+def output_layer(
+    network: AbstractNetwork, policy: AbstractPolicy, obs_size: int, who: str, *agents: int
+) -> int:
     """How many numbers a policy's output layer is given. Raises `TypeError` if it has none that is
     told apart; `who` needs it."""
 
     def parts():
-        obs, key = jnp.zeros(obs_size), jax.random.key(0)
+        obs, key = jnp.zeros((*agents, obs_size)), jax.random.key(0)
         return policy.spoken(obs, policy.start(key=key))
 
     try:
-        return jax.eval_shape(parts)[0].shape[0]
+        return jax.eval_shape(parts)[0].shape[-1]
     except NotImplementedError:
         raise TypeError(
             f"{who} needs what a network's output layer says before its activation, and {network} "
@@ -275,12 +292,12 @@ def require_windows(network: AbstractNetwork, sampling: Sampling, capacity: int,
     if (least < sampling.window or length > capacity) and network.remembers:
         raise ValueError(
             f"batch_size is {least} and the replay buffer has room for {capacity:,} frames, and "
-            f"{type(network).__name__} has memory, which learns from windows of {sampling.window} "
+            f"{require.named(network)} has memory, which learns from windows of {sampling.window} "
             f"frames behind {sampling.burn_in} others: give more, or a smaller sampling.window"
         )
     if sampling.steps > 1 and network.remembers:
         raise ValueError(
-            f"steps is {sampling.steps} and {type(network).__name__} has memory, which learns from "
+            f"steps is {sampling.steps} and {require.named(network)} has memory, which learns from "
             "returns of one step: give steps=1, or a network without memory"
         )
 

@@ -1,6 +1,7 @@
 """DQN: Mnih et al. (2015), "Human-level control through deep reinforcement learning", Algorithm 1,
 for discrete actions; with double Q-learning (van Hasselt et al. 2016), dueling values (Wang et al.
-2016, equation 9) and returns of n steps (`sampling.steps`).
+2016, equation 9) and returns of n steps (`sampling.steps`). The agents of a team learn each for
+itself (Tan 1993, "Multi-agent reinforcement learning: independent vs. cooperative agents").
 
 Departures:
 
@@ -9,9 +10,9 @@ Departures:
 - ε falls with updates, not with frames; beside a population most frames are not the learner's.
 - Targets follow by Polyak averaging, where the paper copies weights now and then.
 - Dueling networks share all layers but the last.
+- Actions that a task does not allow have no value, in targets as in what is played.
 """
 
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -21,8 +22,8 @@ import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .. import require
-from ..environments.base import AbstractTask
 from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.choosing import BARRED
 from ..networks.exploration import EpsilonGreedy
 from ..networks.mlp import MLP, draw_layers, linear
 from ..types import Batch, Metrics
@@ -39,17 +40,10 @@ from .base import (
     output_layer,
     polyak,
     spoken,
+    valued,
 )
 
 DQN_NETWORK = MLP(hidden=(256, 256), activation="relu", initializer="uniform")
-
-
-def choosing(env: AbstractTask, network: MLP) -> MLP:
-    """A network with outputs of which the largest is found whatever their size, if a task has
-    discrete actions. It opens one outside JAX. Where some are not allowed the second largest may
-    count, and outputs stay as they are."""
-    apart = env.discrete and not env.masked
-    return replace(network, output_activation="relative") if apart else network
 
 
 class ActionValues(eqx.Module):
@@ -59,12 +53,16 @@ class ActionValues(eqx.Module):
     policy: AbstractPolicy
     head: dict[str, Float[Array, "..."]] | None  # W_0, b_0: features to V(s); None: not dueling
 
-    def __call__(self, batch: Batch, later: bool = False) -> Float[Array, "act batch"]:
-        """In the rows of a batch, or in what follows them."""
+    def __call__(self, batch: Batch, later: bool = False) -> Float[Array, "act batch *agents"]:
+        """In the rows of a batch, or in what follows them; `BARRED` of what is not allowed."""
         features, q = spoken(self.policy, batch, later)
         if self.head is None:
             return q
-        return linear(self.head, 0, features) + q - jnp.mean(q, axis=0, keepdims=True)
+        allowed = q != BARRED
+        average = jnp.mean(
+            q, axis=0, keepdims=True, where=allowed | ~jnp.any(allowed, axis=0)[None]
+        )
+        return jnp.where(allowed, linear(self.head, 0, features) + q - average, BARRED)
 
 
 class DQNState(eqx.Module):
@@ -80,6 +78,7 @@ class DQN(AbstractLearner):
     """Q-learning of discrete actions. Its actor takes the action of the largest value."""
 
     metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "q")
+    teams: ClassVar[bool] = True
     discrete: ClassVar[bool] = True
 
     gamma: float = 0.99  # γ: discount per step, in [0, 1]
@@ -106,10 +105,10 @@ class DQN(AbstractLearner):
             require.at_least(name, getattr(self, name), 1)
 
     def init(self, network: AbstractNetwork, *sizes: int, key: PRNGKeyArray) -> DQNState:
-        obs_size, action_size = sizes
+        obs_size, _, *agents = sizes
         policy_key, head_key = jax.random.split(key)
-        policy, head = network.init(obs_size, action_size, key=policy_key), None
-        units = output_layer(network, policy, obs_size, "DQN")
+        policy, head = network.init(*sizes, key=policy_key), None
+        units = output_layer(network, policy, obs_size, "DQN", *agents)
         if self.dueling:
             initializer = getattr(network, "initializer", "uniform")
             head = draw_layers((units, 1), initializer, key=head_key)
@@ -139,7 +138,7 @@ class DQN(AbstractLearner):
 
     def value(self, state: DQNState, policy: AbstractPolicy, batch: Batch) -> Value:
         """Of the actions that the policy takes."""
-        return _of(state.values(batch), acts(policy, batch))
+        return valued(state.values(batch), acts(policy, batch))
 
     def warm(self, state: DQNState, actor: AbstractPolicy) -> DQNState:
         """Also without the exploration of one who knows nothing."""
@@ -149,11 +148,5 @@ class DQN(AbstractLearner):
 
 def error(values: ActionValues, batch: Batch, target: Returns) -> tuple[Array, Array]:
     """The mean Huber loss of the values of what was done, and their mean."""
-    q = _of(values(batch), batch.action)
+    q = valued(values(batch), batch.action)
     return mean(optax.huber_loss(q, target[0]), batch.active), mean(q, batch.active)
-
-
-def _of(q: Float[Array, "act batch"], action: Float[Array, "batch act"]) -> Value:
-    """The values of actions, of which the largest entry is the one that was taken."""
-    taken = jnp.argmax(action, axis=1)[None]
-    return jnp.take_along_axis(q, taken, axis=0)[0]

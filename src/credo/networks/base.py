@@ -27,15 +27,7 @@ ACTIVATIONS = {
     "relu": jax.nn.relu,
     "elu": jax.nn.elu,
 }
-OutputActivation = Literal["sigmoid", "tanh", "relative"]
-"""What turns an output into an action in [-1, 1]. `relative`, for discrete actions: how far each
-output is below the largest, tanh(u - max u). The largest is found again, whatever their size, where
-other activations saturate at numbers above 9, and all are alike. Those far below it are alike."""
-OUTPUTS = {
-    "sigmoid": ACTIVATIONS["sigmoid"],
-    "tanh": ACTIVATIONS["tanh"],
-    "relative": lambda u: jnp.tanh(u - jnp.max(u, axis=0, keepdims=True)),
-}
+OutputActivation = Literal["sigmoid", "tanh"]  # what turns an output into an action in [-1, 1]
 INITIALIZERS = {
     "normal": lambda fan_in: 1.0,  # the author's for sequences
     "fan_in": lambda fan_in: fan_in**-0.5,  # the author's for teams
@@ -149,7 +141,7 @@ def features_first(x: Float[Array, "batch *agents size"]) -> Float[Array, "size 
 
 def acted(u: Float[Array, "act *batch"], activation: str) -> Float[Array, "act *batch"]:
     """What an output layer says before its `activation`, as an action in [-1, 1]."""
-    return 2.0 * OUTPUTS["sigmoid"](u) - 1.0 if activation == "sigmoid" else OUTPUTS[activation](u)
+    return 2.0 * jax.nn.sigmoid(u) - 1.0 if activation == "sigmoid" else ACTIVATIONS[activation](u)
 
 
 def to_action(output: Float[Array, "act *batch"], activation: str) -> Float[Array, "act *batch"]:

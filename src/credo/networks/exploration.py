@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .. import require
 from .base import AbstractPolicy
+from .choosing import chosen
 
 
 class AbstractNoise(eqx.Module):
@@ -95,8 +96,8 @@ class AbstractDrawing(AbstractPolicy):
 
 
 class EpsilonGreedy(AbstractDrawing):
-    """A policy of discrete actions, of which every action has an equal chance in a share ε of the
-    steps (Mnih et al. 2015)."""
+    """A policy that chooses, of which every option that is allowed has an equal chance in a share ε
+    of the steps (Mnih et al. 2015)."""
 
     policy: AbstractPolicy
     epsilon: Float[Array, ""]  # ε: that share, in [0, 1]; all of it while `random`
@@ -107,13 +108,14 @@ class EpsilonGreedy(AbstractDrawing):
         key, when_key, which_key = jax.random.split(key, 3)
         action, carry = self.policy(obs, carry)
         drawn = jax.random.uniform(which_key, action.shape, minval=-1.0, maxval=1.0)
-        strays = self.random | (jax.random.uniform(when_key) < self.epsilon)
-        return jnp.where(strays, drawn, action), (carry, key)
+        drawn = chosen(self.policy).allowed(drawn, obs, barred=-1.0)
+        strays = self.random | (jax.random.uniform(when_key, action.shape[:-1]) < self.epsilon)
+        return jnp.where(strays[..., None], drawn, action), (carry, key)
 
 
 class Categorical(AbstractDrawing):
-    """Discrete actions drawn with the probabilities softmax(u) of what a policy says before its
-    output activation: 1 for the one that is drawn, -1 for the others."""
+    """Options drawn, of each choice, with the probabilities softmax(u) of what a policy says before
+    its output activation: 1 for the one that is drawn, -1 for the others."""
 
     policy: AbstractPolicy
 
@@ -121,5 +123,10 @@ class Categorical(AbstractDrawing):
         carry, key = carry
         key, drawn_key = jax.random.split(key)
         _, u, carry = self.policy.spoken(obs, carry)
-        chosen = jax.random.categorical(drawn_key, u)
-        return jnp.where(jnp.arange(len(u)) == chosen, 1.0, -1.0), (carry, key)
+        drawn = []
+        for i, part in enumerate(chosen(self.policy).parts(u)):
+            part_key = jax.random.fold_in(drawn_key, i) if i else drawn_key
+            taken = jax.random.categorical(part_key, part)[..., None]
+            options = jnp.broadcast_to(jnp.arange(part.shape[-1]), part.shape)
+            drawn.append(jnp.where(options == taken, 1.0, -1.0))
+        return jnp.concatenate(drawn, axis=-1), (carry, key)

@@ -26,7 +26,6 @@ from .. import require
 from .base import (
     ACTIVATIONS,
     INITIALIZERS,
-    OUTPUTS,
     AbstractNetwork,
     AbstractPolicy,
     OutputActivation,
@@ -199,7 +198,7 @@ class MMUPolicy(AbstractPolicy):
         else:
             m = (1.0 - c.alpha) * (m + w * f) + c.alpha * (w * f + (1.0 - w) * m)  # (3.4)
         u = matvec(self.Z_y, h) + self.b_y
-        return h, u, (OUTPUTS[c.output_activation](u), m)  # (3.5)
+        return h, u, (ACTIVATIONS[c.output_activation](u), m)  # (3.5)
 
     def _inputs(self, x, y, m):
         """What the input gate, the block input, the read gate and the write gate are fed."""

@@ -4,7 +4,8 @@ Each agent answers to its own observation with its own head; heads stand on a tr
 Everything or nothing may be shared instead. And critics that see a whole team.
 """
 
-from typing import ClassVar, Literal
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -117,14 +118,33 @@ class TeamPolicy(AbstractPolicy):
     def __call__(
         self, obs: Float[Array, "agents obs"], carry: PyTree
     ) -> tuple[Float[Array, "agents act"], PyTree]:
+        return self._answers(lambda head: head, obs, carry)
+
+    def spoken(self, obs: Float[Array, "agents obs"], carry: PyTree) -> tuple[Array, Array, PyTree]:
+        """Of each agent, in rows."""
+
+        def told(head: AbstractPolicy):
+            def parts(x, carry):
+                features, u, carry = head.spoken(x, carry)
+                return (features, u), carry
+
+            return parts
+
+        (features, u), carry = self._answers(told, obs, carry)
+        return features, u, carry
+
+    def _answers(self, said: Callable[..., Any], obs: Array, carry: PyTree) -> tuple[Any, PyTree]:
+        """What each agent's `said(head)` says, in rows, and the next carry."""
+
         def one(trunk, head, obs, carry):
             c = self.config
-            return head(hidden_layers(trunk, obs, len(c.trunk), c.activation, "none"), carry)
+            x = hidden_layers(trunk, obs, len(c.trunk), c.activation, "none")
+            return said(head)(x, carry)
 
         if self.apart:
             each = zip(self.trunks, self.heads, obs, carry, strict=True)
-            actions, carries = zip(*(one(*agent) for agent in each), strict=True)
-            return jnp.stack(actions), carries
+            told, carries = zip(*(one(*agent) for agent in each), strict=True)
+            return jax.tree.map(lambda *rows: jnp.stack(rows), *told), carries
         return self._each(one, obs, carry)
 
     @property

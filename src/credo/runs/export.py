@@ -52,7 +52,7 @@ def parts_of(policy: Any) -> tuple[dict[str, Any], Weights]:
         )
     kind, own, inner = KINDS[name]
     settings = config.to_tree(getattr(policy, "config", {}))
-    fields = {k: v for k, v in settings.items() if k not in ("class", "head")}
+    fields = {k: v for k, v in settings.items() if k not in ("class", "head", "network")}
     weights = {k: np.array(w, np.float32) for k, w in own(policy).items() if eqx.is_array(w)}
     parts = []
     for prefix, part in inner(policy).items():
@@ -89,6 +89,7 @@ KINDS: dict[str, tuple[str, Any, Any]] = {
     "TeamPolicy": ("Team", _trunks, _numbered("heads")),
     "DMMUPolicy": ("DMMU", lambda _: {}, _numbered("agents")),
     "CentralizedPolicy": ("Centralized", lambda _: {}, _within),
+    "ChoosingPolicy": ("Choosing", lambda _: {}, _within),
     "Normalized": ("Normalized", lambda p: {"mean": p.mean, "std": p.std}, _within),
 }
 """Of each policy its network's name for the runner, its own weights, and the policies within."""
@@ -111,4 +112,6 @@ def _describe(run: Run, network: dict[str, Any]) -> dict[str, Any]:
         "action": task["actions"],
         "observations": task.get("observations"),
         "names": task.get("names"),
+        "choices": task.get("choices") or (),
+        "masked": task.get("masked", False),
     }
