@@ -62,6 +62,7 @@ from .learners.td3 import matd3 as matd3
 from .networks.base import AbstractNetwork as AbstractNetwork
 from .networks.base import AbstractPolicy as AbstractPolicy
 from .networks.choosing import choosing as choosing
+from .networks.convolutional import Convolutional as Convolutional
 from .networks.dmmu import DMMU as DMMU
 from .networks.dnc import DNC as DNC
 from .networks.exploration import Explorer as Explorer

@@ -495,6 +495,39 @@ def _normalize(x: np.ndarray, gain: np.ndarray, shift: np.ndarray) -> np.ndarray
     return gain * x + shift
 
 
+class Convolutional:
+    """`credo.networks.convolutional`: `W_l`, `b_l` of each convolution l, and a head. The memory is
+    the head's."""
+
+    def __init__(self, node: Node):
+        c, shape = node.config, tuple(node.config["shape"])
+        self._start, size = c["start"], math.prod(shape)
+        self._end, self._scale, self._layers = self._start + size, np.float32(c["scale"]), []
+        sound = all(type(n) is int and n > 0 for n in (*shape, self._start + 1))
+        if not sound or len(shape) != 3 or self._end > node.x or not self._scale > 0:
+            raise ValueError(f"its image of {shape} from {self._start} on is not in an observation")
+        layers = zip(c["channels"], c["kernels"], c["strides"], strict=True)
+        for i, (n, kernel, stride) in enumerate(layers):
+            height, width, channels = shape
+            at = np.arange(height * width * channels).reshape(shape)
+            at = np.lib.stride_tricks.sliding_window_view(at, (kernel, kernel), axis=(0, 1))
+            at = at[::stride, ::stride].transpose(0, 1, 3, 4, 2)
+            inputs = kernel * kernel * channels
+            w, b = node.claim(f"W_{i}", n, inputs), node.claim(f"b_{i}", n)
+            shape = (*at.shape[:2], n)
+            self._layers.append((at.reshape(-1, inputs), w, b))
+        self._activation = ACTIVATIONS[c["activation"]]
+        self._head = node.part(0, "head", node.x - size + math.prod(shape), node.y)
+        self.start = self._head.start
+
+    def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
+        beside = np.append(x[: self._start], x[self._end :])
+        x = x[self._start : self._end] / self._scale
+        for at, w, b in self._layers:
+            x = self._activation(x[at] @ w.T + b).ravel()
+        return self._head(np.append(beside, x), memory)
+
+
 class MMU:
     """`credo.networks.mmu`: Khadka (2019), equations 3.1-3.5. The memory is (y, m)."""
 
@@ -928,6 +961,7 @@ def _saying(described: dict[str, Any]) -> dict[str, Any]:
 NETWORKS: dict[str, tuple[Callable[[Node], Any], bool | None]] = {
     "MLP": (MLP, False),
     "MMU": (MMU, False),
+    "Convolutional": (Convolutional, False),
     "Recurrent": (Recurrent, False),
     "NTM": (NTM, False),
     "DNC": (DNC, False),

@@ -191,6 +191,29 @@ class Answers(Tiny):
         return super().step(action)[0], *self.said, {}
 
 
+class Words(gymnasium.Space):
+    """No array holds it, and it does not say so."""
+
+    def sample(self, mask=None, probability=None):
+        return "go"
+
+    def contains(self, x):
+        return isinstance(x, str)
+
+
+class Worded(Grid):
+    """Observations of which one is a text, as in MiniGrid."""
+
+    observation_space = gymnasium.spaces.Dict({"mission": Words(), "at": Box(-1, 1, (2,))})
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return {"mission": "go", "at": np.float32([0.25, 0.5])}, {}
+
+    def step(self, action):
+        return {"mission": "go", "at": np.float32([0.25, 0.5])}, 0.0, False, False, {}
+
+
 class Masked(gymnasium.Env):
     """Pays the action that was taken; `where` it says which are allowed: 0 and 3, then 1 and 2."""
 

@@ -129,6 +129,13 @@ def test_the_largest_entry_that_is_allowed_is_played(where):
     assert action.tolist() == np.float32([[0.1, 0.9, 0.8, 0.3]]).tolist()
 
 
+def test_an_observation_that_is_no_number_is_left_out_and_that_is_said():
+    env = here("Worded")
+    with pytest.warns(UserWarning, match="its observation 'mission' is no array of numbers"):
+        assert env.obs_size == 2
+    assert first(env)[1].tolist() == [0.25, 0.5]
+
+
 def test_a_mask_that_allows_nothing_is_a_fault_but_at_the_end():
     action = np.float32([0, 1, 0, 0])
     with pytest.raises(EnvironmentFailure, match="allows no action: its action_mask is 0"):

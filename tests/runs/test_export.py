@@ -17,6 +17,7 @@ from credo.environments.simple_spread import SimpleSpread
 from credo.environments.wrappers import DelayedHostReward
 from credo.networks.base import ACTIVATIONS, AbstractNetwork, AbstractPolicy
 from credo.networks.choosing import Choosing
+from credo.networks.convolutional import Convolutional
 from credo.networks.dmmu import DMMU
 from credo.networks.dnc import DNC
 from credo.networks.graph import Graph
@@ -48,6 +49,7 @@ NETWORKS = [
     MMU(4, start_weights="saturated"),
     *(Graph(4, activation=a, passes=p) for a in ("sigmoid", "tanh") for p in (1, 3)),
     Graph(4, "lstm"),
+    Convolutional(MLP((4,)), (1, 3, 1), channels=(2,), kernels=(1,), scale=2.0),
     *(Recurrent(c, 4, o) for c in ("rnn", "gru", "lstm") for o in ("sigmoid", "tanh")),
     NTM("lstm", hidden=4, rows=6, width=3),
     NTM("feedforward", 4, 5, 3, 2, 2, 2, start_memory="constant", output_activation="tanh"),

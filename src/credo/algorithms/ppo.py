@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .. import require, tree
 from ..compilation import float32, jit
-from ..learners.base import act, adam, adam_state, averaged, mean, windows_of
+from ..learners.base import act, adam, adam_state, averaged, mean, said_at_once, windows_of
 from ..networks.base import AbstractNetwork, AbstractPolicy
 from ..networks.choosing import choosing, chosen
 from ..networks.exploration import Categorical, Explorer, GaussianNoise
@@ -100,7 +100,7 @@ class Choice(eqx.Module):
         return step
 
     def told(self, obs: Float[Array, "rows obs"]) -> Float[Array, "rows act"]:
-        return self.mean.spoken(obs.T, ())[1].T
+        return said_at_once(self.mean, obs)[1].T
 
     def explorer(self, size: int) -> AbstractPolicy:
         return Categorical(self.mean)

@@ -190,6 +190,8 @@ def _network(line: Line, name: str | None, algorithm: str, env: Any) -> Any:
     if ALGORITHMS[algorithm].get("gradient"):
         fields = fields | NETWORKS[name].get("gradient", {})
     network = load(NETWORKS[name]["path"])(**fields)
+    if hasattr(network, "seeing"):
+        network = network.seeing(env)
     if env.agents is not None and not network.team and algorithm != "ccea":
         from ..networks.team import Team
 

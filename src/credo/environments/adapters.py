@@ -70,7 +70,7 @@ class Single:
         return env
 
     def __init__(self, env: gymnasium.Env, spec: dict[str, Any]):
-        self.warnings = _lasting(env)
+        self.warnings = _lasting(env) + _left_out(env.observation_space)
         self.max_steps = self._limit(env, spec["max_episode_steps"])
         acts = _actions(env.action_space)
         self.action_size, self.choices, self._choose = acts.size, list(acts.choices), acts.read
@@ -82,7 +82,7 @@ class Single:
         if self.masked and not self._seen:
             flat = flat.behind(self._options)
         self.obs_size, self._write, self.obs_dtype = flat.size, flat.write, flat.dtype
-        self.obs_range = flat.bounds
+        self.obs_range, self.image = flat.bounds, flat.image
         self.observations = _choice(env.observation_space)
         self.said: dict[int, Any] = {}  # by copy: its last observation, as it came
         self._masks: dict[int, np.ndarray] = {}  # by copy: which options it allows next
@@ -193,6 +193,7 @@ class Team:
     """
 
     observations: ClassVar[None] = None
+    image: ClassVar[None] = None
 
     @staticmethod
     def make(spec: dict[str, Any]) -> Any:
@@ -578,6 +579,7 @@ class _Flat(NamedTuple):
     low: np.ndarray  # [size], float64
     high: np.ndarray
     write: Callable[[Any, np.ndarray], None]  # an observation into a row
+    image: tuple[int, ...] | None = None  # where the first image begins, and its shape
 
     @property
     def bounds(self) -> list[Any]:
@@ -587,9 +589,9 @@ class _Flat(NamedTuple):
     def behind(self, n: int) -> "_Flat":
         """The same row behind n numbers, from 0 to 1, that others write."""
         low, high = np.append(np.zeros(n), self.low), np.append(np.ones(n), self.high)
-        return _Flat(
-            n + self.size, self.dtype, low, high, lambda obs, row: self.write(obs, row[n:])
-        )
+        image = self.image and (n + self.image[0], *self.image[1:])
+        write = lambda obs, row: self.write(obs, row[n:])  # noqa: E731
+        return _Flat(n + self.size, self.dtype, low, high, write, image)
 
 
 def _flat(space: gymnasium.Space, said: str = "an observation", first: str | None = None) -> _Flat:
@@ -597,7 +599,7 @@ def _flat(space: gymnasium.Space, said: str = "an observation", first: str | Non
     `said` names them in a `Fault`, which is raised of a space that NumPy cannot hold (Graph,
     Sequence)."""
     spaces = gymnasium.spaces
-    if not (isinstance(space, gymnasium.Space) and space.is_np_flattenable):
+    if not _told_in_numbers(space):
         raise Fault(
             f"has the observation space {space}",
             "use a Box, a Discrete, or a Dict or Tuple of them",
@@ -606,9 +608,10 @@ def _flat(space: gymnasium.Space, said: str = "an observation", first: str | Non
         low, high = (np.float64(bound).ravel() for bound in (space.low, space.high))
         small = space.dtype == np.uint8
         write = _box_writer(space, said)
-        return _Flat(low.size, "uint8" if small else "float32", low, high, write)
+        image = (0, *space.shape) if len(space.shape) == 3 else None
+        return _Flat(low.size, "uint8" if small else "float32", low, high, write, image)
     if isinstance(space, spaces.Dict):
-        parts = dict(space.spaces)
+        parts = {key: part for key, part in space.spaces.items() if _told_in_numbers(part)}
         if first is not None:
             parts = {first: parts[first]} | parts
         return _joined(space, parts, Mapping, said)
@@ -626,6 +629,28 @@ def _flat(space: gymnasium.Space, said: str = "an observation", first: str | Non
     size, hot = spaces.flatdim(space), not isinstance(space, spaces.Text)
     low, high = (0.0, 1.0) if hot else (-np.inf, np.inf)
     return _Flat(size, "float32", np.full(size, low), np.full(size, high), write_other)
+
+
+def _told_in_numbers(space: Any) -> bool:
+    """Whether a space is one, or is made of such, that an array can hold; of a Dict some part."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return any(map(_told_in_numbers, space.spaces.values()))
+    try:
+        return isinstance(space, gymnasium.Space) and space.is_np_flattenable
+    except NotImplementedError:  # of a space of its own that does not say
+        return False
+
+
+def _left_out(space: Any) -> list[str]:
+    """Warnings of parts of a Dict of observations that are no numbers, such as a text of MiniGrid:
+    policies do not see them."""
+    parts = getattr(space, "spaces", None)
+    if not isinstance(parts, Mapping):
+        return []
+    left = [key for key, part in parts.items() if not _told_in_numbers(part)]
+    if len(left) == len(parts):
+        return []
+    return [f"its observation {key!r} is no array of numbers, and is left out" for key in left]
 
 
 def _box_writer(space: Any, said: str) -> Callable[[Any, np.ndarray], None]:
@@ -657,13 +682,15 @@ def _box_writer(space: Any, said: str) -> Callable[[Any, np.ndarray], None]:
 def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
     """The parts of a Dict or Tuple, one after the other, each by its own rule."""
     flats = {key: _flat(part, f"{said} with {key!r}") for key, part in parts.items()}
-    writes, at = [], 0
+    writes, at, image = [], 0, None
     for key, flat in flats.items():
         writes.append((key, slice(at, at + flat.size), flat.write))
+        if flat.image and not image:
+            image = (at + flat.image[0], *flat.image[1:])
         at += flat.size
 
     def write(obs: Any, row: np.ndarray) -> None:
-        if not isinstance(obs, kind) or len(obs) != len(writes):
+        if not isinstance(obs, kind) or len(obs) != len(space.spaces):
             told = f"the keys {list(obs)}" if isinstance(obs, Mapping) else _kind(obs)
             raise Fault(
                 f"returned {said} of {told}",
@@ -682,7 +709,7 @@ def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
         np.concatenate([np.zeros(0), *bounds])
         for bounds in ([x.low for x in flats.values()], [x.high for x in flats.values()])
     )
-    return _Flat(at, "uint8" if small and flats else "float32", low, high, write)
+    return _Flat(at, "uint8" if small and flats else "float32", low, high, write, image)
 
 
 def _kind(x: Any) -> str:

@@ -40,6 +40,10 @@ class AbstractTask(eqx.Module):
     obs_range: ClassVar[tuple[Any, Any]] = (-math.inf, math.inf)
     """The least and the largest number in an observation."""
 
+    image: ClassVar[tuple[int, int, int, int] | None] = None
+    """Where the image in an observation begins, its height, its width and its channels; None: there
+    is none."""
+
     @property
     def reported(self) -> str:
         """The reward signal by which a champion is judged."""

@@ -94,6 +94,11 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
 
     masked = _size("masked")
 
+    @property
+    def image(self) -> tuple[int, int, int, int] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        said = self._sizes()["image"]
+        return said and tuple(said)
+
     def spec(self) -> dict[str, Any]:
         """What a worker must know to open it, as JSON has it."""
         return {
@@ -464,9 +469,11 @@ def told(env: AbstractForeignEnvironment) -> tuple[dict[str, Any] | None, dict[s
 
 
 def know(env: AbstractForeignEnvironment, what: tuple[Any, dict[str, Any]]) -> None:
-    """Take what `told` said in another process; the task need not be opened for it here."""
+    """Take what `told` said in another process; the task need not be opened for it here, and what
+    its users should know was said there."""
     names.register(what[0])
     _SIZES[env] = what[1]
+    _WARNED.update(f"{env.id}: {said}" for said in what[1]["warnings"])
 
 
 def close(env: AbstractHostEnvironment) -> None:

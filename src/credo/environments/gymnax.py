@@ -93,6 +93,14 @@ class Gymnax(AbstractEnvironment):
         return (int(space.n),) if isinstance(space, spaces.Discrete) else ()
 
     @property
+    def image(self) -> tuple[int, int, int, int] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        shape = getattr(self._env.observation_space(self._params), "shape", ())
+        if len(shape) != 3:
+            return None
+        height, width, channels = map(int, shape)
+        return 0, height, width, channels
+
+    @property
     def max_steps(self) -> int:
         return int(self._params.max_steps_in_episode)
 

@@ -87,6 +87,10 @@ class Hiding(eqx.Module):
             raise ValueError(f"hides all {n} entries of an observation: leave one or more")
 
     @property
+    def image(self) -> None:
+        """None: of an image some entries may be hidden."""
+
+    @property
     def kept(self) -> np.ndarray:
         """Entries that are told."""
         return np.setdiff1d(np.arange(self.env.obs_size), self.entries)

@@ -35,6 +35,7 @@ SIZES = (
     "action_size",
     "max_steps",
     "choices",
+    "image",
     "masked",
     "agents",
     "signals",

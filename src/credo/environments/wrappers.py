@@ -109,6 +109,7 @@ class AbstractWrapper(AbstractEnvironment):
     reported = _of("env", "reported")
     unwrapped = _of("env", "unwrapped")
     choices = _of("env", "choices")
+    image = _of("env", "image")
     masked = _of("env", "masked")
 
     def bare(self, state: PyTree) -> PyTree:
@@ -223,6 +224,7 @@ class AbstractHostWrapper(AbstractHostEnvironment):
     reported = _of("env", "reported")
     unwrapped = _of("env", "unwrapped")
     choices = _of("env", "choices")
+    image = _of("env", "image")
     masked = _of("env", "masked")
     reward_shapes = _of("env", "reward_shapes")
     obs_dtype = _of("env", "obs_dtype")

@@ -237,10 +237,8 @@ def spoken(
 ) -> tuple[Float[Array, "units batch *agents"], Float[Array, "act batch *agents"]]:
     """What a policy's output layer is given, and says before its activation, in the rows of a batch
     or after them. `stored` as of `unrolled`."""
-    obs = batch.next_obs if later else batch.obs
-    if batch.windows is None and policy.features_first:
-        features, said, _ = policy.spoken(obs.T, ())
-        return features, said
+    if batch.windows is None:
+        return said_at_once(policy, batch.next_obs if later else batch.obs)
 
     def step(policy: AbstractPolicy):
         def parts(obs, carry):
@@ -249,14 +247,18 @@ def spoken(
 
         return parts
 
-    if batch.windows is None:
-        start = policy.start(key=jax.random.key(0))
-        told = jax.vmap(lambda x: step(policy)(x, start)[0])(obs)
-    else:
-        told = unrolled(policy, seen_in(batch, later), batch.windows, stored, said=step)
-        told = tuple(by_row(x, later) for x in told)
-    features, said = map(features_first, told)
+    told = unrolled(policy, seen_in(batch, later), batch.windows, stored, said=step)
+    features, said = (features_first(by_row(x, later)) for x in told)
     return features, said
+
+
+def said_at_once(policy: AbstractPolicy, obs: Float[Array, "batch *agents obs"]):
+    """The same of a policy without memory, for observations of a batch."""
+    if policy.features_first:
+        return policy.spoken(obs.T, ())[:2]
+    start = policy.start(key=jax.random.key(0))
+    features, said = jax.vmap(lambda x: policy.spoken(x, start)[:2])(obs)
+    return features_first(features), features_first(said)
 
 
 def valued(

@@ -90,9 +90,14 @@ class AbstractNetwork(eqx.Module):
     """Whether its policies act for all agents; `init` then takes their number behind the sizes."""
 
     @property
+    def least(self) -> int:
+        """Numbers of an observation that it can be made for, to look at its form."""
+        return 2
+
+    @property
     def remembers(self) -> bool:
         """Whether its policies have memory."""
-        sizes = (2, 1, *(2,) * self.team)
+        sizes = (self.least, 1, *(2,) * self.team)
         first = jax.eval_shape(lambda: self.init(*sizes, key=jax.random.key(0)).first())
         return first is not None
 

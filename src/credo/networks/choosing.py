@@ -36,6 +36,10 @@ class Choosing(AbstractNetwork):
     def team(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.network.team
 
+    @property
+    def least(self) -> int:
+        return self.network.least
+
     def init(self, obs_size: int, action_size: int, *agents: int, key: PRNGKeyArray):
         return ChoosingPolicy(self.network.init(obs_size, action_size, *agents, key=key), self)
 
@@ -122,11 +126,11 @@ def choosing(env: Any, network: AbstractNetwork) -> AbstractNetwork:
 
 def tells(network: AbstractNetwork) -> bool:
     """Whether its policies tell what they say before their output activation."""
-    sizes = (2, 1, *(2,) * network.team)
+    n, team = network.least, (2,) * network.team
 
     def parts():
-        policy = network.init(*sizes, key=jax.random.key(0))
-        obs = jnp.zeros((2, 2) if network.team else 2)
+        policy = network.init(n, 1, *team, key=jax.random.key(0))
+        obs = jnp.zeros((*team, n))
         return policy.spoken(obs, policy.start(key=jax.random.key(0)))
 
     try:

@@ -47,8 +47,9 @@ def parts_of(policy: Any) -> tuple[dict[str, Any], Weights]:
     name = type(policy).__name__
     if not type(policy).__module__.startswith("credo.networks.") or name not in KINDS:
         raise RunError(
-            f"{name} cannot be exported: the runner knows MLP, MMU, Recurrent, NTM, DNC and Graph, "
-            "teams of them, DMMU and Centralized; from Python, Run(path).policy() plays any network"
+            f"{name} cannot be exported: the runner knows MLP, MMU, Recurrent, NTM, DNC, Graph "
+            "and Convolutional, teams of them, DMMU and Centralized; from Python, "
+            "Run(path).policy() plays any network"
         )
     kind, own, inner = KINDS[name]
     settings = config.to_tree(getattr(policy, "config", {}))
@@ -81,6 +82,7 @@ def _within(policy: Any) -> dict[str, Any]:
 
 KINDS: dict[str, tuple[str, Any, Any]] = {
     "MLPPolicy": ("MLP", lambda policy: policy.weights, lambda _: {}),
+    "ConvolutionalPolicy": ("Convolutional", lambda p: p.weights, lambda p: {"head": p.head}),
     "MMUPolicy": ("MMU", vars, lambda _: {}),
     "RecurrentPolicy": ("Recurrent", lambda policy: policy.weights, lambda _: {}),
     "NTMPolicy": ("NTM", lambda policy: policy.weights, lambda _: {}),
