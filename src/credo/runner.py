@@ -838,15 +838,25 @@ class Team:
     }
 
     def __init__(self, node: Node):
-        own_trunks, own_heads = self.OWN[node.config["sharing"]]
         layers = node.config | {"hidden": node.config["trunk"], "normalization": "none"}
+        whose = self._whose(node.config, node.agents)
 
-        def each(own: bool, made: Callable[[int], Any]) -> list[Any]:
-            return [made(k) for k in range(node.agents)] if own else [made(0)] * node.agents
+        def each(whose: list[int], made: Callable[[int], Any]) -> list[Any]:
+            parts = {k: made(k) for k in dict.fromkeys(whose)}
+            return [parts[k] for k in whose]
 
-        self._trunks = each(own_trunks, lambda k: Layers(node.within(f"trunks.{k}"), layers))
+        self._trunks = each(whose[0], lambda k: Layers(node.within(f"trunks.{k}"), layers))
         size = self._trunks[0].size
-        self._heads = each(own_heads, lambda k: node.part(k, f"heads.{k}", size, node.y))
+        self._heads = each(whose[1], lambda k: node.part(k, f"heads.{k}", size, node.y))
+
+    def _whose(self, config: dict[str, Any], agents: int) -> list[list[int]]:
+        """Which trunk and which head each agent has."""
+        if config["sharing"] == "groups":
+            groups = list(config["groups"])
+            if len(groups) != agents:
+                raise ValueError(f"its groups are {groups}, of {agents} agents")
+            return [groups, groups]
+        return [list(range(agents)) if own else [0] * agents for own in self.OWN[config["sharing"]]]
 
     def start(self, random: "np.random.Generator") -> list[Any]:
         return [head.start(random) for head in self._heads]

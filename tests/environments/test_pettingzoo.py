@@ -153,6 +153,21 @@ def test_the_time_limit_is_the_lesser_one(asked, limit):
     assert ends == [False] * (limit - 1) + [True]
 
 
+def test_agents_of_one_kind_are_a_group():
+    unlike, alike = pair(in_process=True), pair("Movable", in_process=True)
+    assert unlike.groups == (0, 1)
+    network = Team((4,), sharing="groups").fitted(unlike)
+    assert network.groups == (0, 1)
+    assert len(network.init(*unlike.sizes, key=jax.random.key(0)).heads) == 2
+    spread = Team((4,), sharing="groups").fitted(SimpleSpread())
+    assert spread.groups == (0, 0, 0)
+    assert alike.groups == (0, 1)  # they see different things
+    with pytest.raises(
+        ValueError, match=r"groups are \(0, 1\) of 3 agents: give the group of each"
+    ):
+        network.init(3, 2, 3, key=jax.random.key(0))
+
+
 def test_continuous_actions_are_asked_for():
     assert pair("Movable", in_process=True).sizes == (3, 2, 2)
     asked = pair("Movable", in_process=True, kwargs={"continuous_actions": False})

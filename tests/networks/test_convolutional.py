@@ -89,16 +89,16 @@ def test_the_runner_sees_the_same(head):
 
 
 def test_a_task_says_where_its_image_is():
-    network = Convolutional().seeing(Look())
+    network = Convolutional().fitted(Look())
     assert (network.shape, network.start, network.scale) == ((6, 6, 1), 2, 255.0)
     pictures = Gymnasium("pictures:Pictures", in_process=True, max_episode_steps=5)
     assert pictures.image == (3 + 2, 4, 5, 3)
-    assert Convolutional().seeing(pictures).scale == 255.0
-    assert network.seeing(pictures) is network
+    assert Convolutional().fitted(pictures).scale == 255.0
+    assert network.fitted(pictures) is network
     assert hidden(pictures, (0,)).image is None
     for env in (Gymnasium("CartPole-v1", in_process=True), hidden(pictures, (0,))):
         with pytest.raises(ValueError, match="shows no image, a Box of height, width and channels"):
-            Convolutional().seeing(env)
+            Convolutional().fitted(env)
 
 
 WRONG = {
@@ -117,7 +117,7 @@ def test_what_it_cannot_see_is_named(name):
         Convolutional(**{"shape": (6, 6, 1), "start": 2} | fields).init(38, 2, key=KEY)
 
 
-NETWORK = Convolutional(MLP((16,), "relu", initializer="uniform"), channels=(4,)).seeing(Look())
+NETWORK = Convolutional(MLP((16,), "relu", initializer="uniform"), channels=(4,)).fitted(Look())
 
 
 def test_it_sees_by_gradient_and_by_evolution():

@@ -12,7 +12,7 @@ from credo import tree
 from credo.networks.mlp import MLP, Critic
 from credo.networks.mmu import MMU
 from credo.networks.recurrent import Recurrent
-from credo.networks.team import Centralized, JointCritic, Team
+from credo.networks.team import Centralized, JointCritic, Team, TeamPolicy
 
 OBS, ACT, AGENTS = 3, 2, 4
 KEY = jax.random.key(0)
@@ -228,7 +228,10 @@ def test_a_team_is_told_by_its_config():
     ("fields", "told"),
     [
         ({"trunk": (5, 0)}, r"trunk\[1\] is 0: it must be at least 1"),
-        ({"sharing": "heads"}, "sharing is 'heads': it must be one of everything, nothing, trunk"),
+        (
+            {"sharing": "heads"},
+            "sharing is 'heads': it must be one of everything, groups, nothing, trunk",
+        ),
         ({"activation": "swish"}, "activation is 'swish'"),
         ({"initializer": "zeros"}, "initializer is 'zeros'.*uniform"),
     ],
@@ -359,3 +362,22 @@ def test_members_are_all_weights_of_an_agent():
     np.testing.assert_allclose(first(turned, obs[::-1])[::-1], first(apart, obs), atol=1e-6)
     assert made(TEAMS["trunk"]).members is None
     assert made(TEAMS["everything"]).members is None
+
+
+def test_agents_of_a_group_share_all_and_no_more():
+    """Two policies in one: what an agent says is what the network of its group says."""
+    groups = (0, 1, 0, 1)
+    network = Team((5,), Recurrent("gru", 3), "groups", groups=groups)
+    policy = network.init(3, 2, 4, key=jax.random.key(0))
+    assert len(policy.trunks) == len(policy.heads) == 2
+    obs = jax.random.normal(jax.random.key(1), (4, 3))
+    for one in (policy, policy.arranged()):
+        action, _ = one(obs, one.start(key=jax.random.key(0)))
+        for agent, group in enumerate(groups):
+            alone = Team((5,), Recurrent("gru", 3), "everything")
+            alone = TeamPolicy((policy.trunks[group],), (policy.heads[group],), alone, 4)
+            expected = alone(obs, alone.start(key=jax.random.key(0)))[0][agent]
+            np.testing.assert_allclose(action[agent], expected, rtol=1e-6)
+    alike, _ = policy(jnp.ones((4, 3)), policy.start(key=jax.random.key(0)))
+    np.testing.assert_array_equal(alike[0], alike[2])
+    assert np.abs(alike[0] - alike[1]).max() > 1e-3

@@ -69,6 +69,7 @@ TEAMS = [
     *(Team((5,), head, sharing) for head in HEADS for sharing in ("trunk", "nothing")),
     *(Team((5, 4), head, "everything", "relu") for head in HEADS[:2]),
     Team((), MMU(3), "nothing"),  # what CCEA drafts
+    *(Team((4,), head, "groups", groups=(0, 1, 0)) for head in HEADS[1:3]),
     *(DMMU(cell, 4, order=order) for cell in ("mmu", "lstm", "gru", "rnn") for order in ORDERS),
     *(DMMU(cell, 4, access=a) for cell in ("mmu", "gru") for a in ("everyone", "acting")),
     DMMU("mmu", (3, 4, 5), 4),

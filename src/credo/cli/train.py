@@ -126,7 +126,6 @@ def algorithm_of(line: Line, command: Train) -> Any:
     build, fields = _builder(word, command.preset)
     line.reserved |= fields
     env = _task(line, command)
-    network = _network(line, command.network or ALGORITHMS[word].get("network"), word, env)
     if command.hide:
         from ..environments.hidden import hidden
 
@@ -139,7 +138,11 @@ def algorithm_of(line: Line, command: Train) -> Any:
         from ..environments.last_step import with_last_step
 
         env = with_last_step(env)
-    return line.take(build(env, network))
+    network = _network(line, command.network or ALGORITHMS[word].get("network"), word, env)
+    algorithm = line.take(build(env, network))
+    fitted = algorithm.network.fitted(env)
+    same = fitted == algorithm.network
+    return algorithm if same else dataclasses.replace(algorithm, network=fitted)
 
 
 def _task(line: Line, command: Train) -> Any:
@@ -190,13 +193,11 @@ def _network(line: Line, name: str | None, algorithm: str, env: Any) -> Any:
     if ALGORITHMS[algorithm].get("gradient"):
         fields = fields | NETWORKS[name].get("gradient", {})
     network = load(NETWORKS[name]["path"])(**fields)
-    if hasattr(network, "seeing"):
-        network = network.seeing(env)
     if env.agents is not None and not network.team and algorithm != "ccea":
         from ..networks.team import Team
 
         network = Team(trunk=(), head=network, sharing="nothing")
-    network = line.take(network, "network.")
+    network = line.take(network, "network.").fitted(env)
     if algorithm == "ccea":
         return network
     from ..networks.choosing import choosing

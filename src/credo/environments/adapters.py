@@ -48,6 +48,7 @@ class Single:
     """
 
     agents: ClassVar[int | None] = None
+    groups: ClassVar[None] = None
     names: ClassVar[None] = None
     signals: ClassVar[list[tuple[str, bool]]] = [("reward", False)]  # name, private to an agent
 
@@ -222,6 +223,8 @@ class Team:
         self._rows = {name: k for k, name in enumerate(self.names)}
         self._learn_actions(env)
         spaces = [env.observation_space(name) for name in self.names]
+        kinds = [(str(space), str(told)) for space, told in zip(spaces, self.actions, strict=True)]
+        self.groups = [list(dict.fromkeys(kinds)).index(kind) for kind in kinds]
         self._seen = [_shown_mask(space) is not None for space in spaces]
         self.masked = self._uneven or any(self._seen) or (bool(self.choices) and _masks(env))
         flats = [self._flat(space, seen) for space, seen in zip(spaces, self._seen, strict=True)]

@@ -45,6 +45,12 @@ class AbstractTask(eqx.Module):
     is none."""
 
     @property
+    def groups(self) -> tuple[int, ...] | None:
+        """Of a team the group of each agent, counted from 0: those of one group see and do the same
+        kind of things. By default all are alike."""
+        return None if self.agents is None else (0,) * self.agents
+
+    @property
     def reported(self) -> str:
         """The reward signal by which a champion is judged."""
         return self.signals[-1]

@@ -99,6 +99,11 @@ class AbstractForeignEnvironment(AbstractHostEnvironment):
         said = self._sizes()["image"]
         return said and tuple(said)
 
+    @property
+    def groups(self) -> tuple[int, ...] | None:
+        said = self._sizes()["groups"]
+        return said and tuple(said)
+
     def spec(self) -> dict[str, Any]:
         """What a worker must know to open it, as JSON has it."""
         return {

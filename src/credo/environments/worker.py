@@ -36,6 +36,7 @@ SIZES = (
     "max_steps",
     "choices",
     "image",
+    "groups",
     "masked",
     "agents",
     "signals",

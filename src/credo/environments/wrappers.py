@@ -110,6 +110,7 @@ class AbstractWrapper(AbstractEnvironment):
     unwrapped = _of("env", "unwrapped")
     choices = _of("env", "choices")
     image = _of("env", "image")
+    groups = _of("env", "groups")
     masked = _of("env", "masked")
 
     def bare(self, state: PyTree) -> PyTree:
@@ -225,6 +226,7 @@ class AbstractHostWrapper(AbstractHostEnvironment):
     unwrapped = _of("env", "unwrapped")
     choices = _of("env", "choices")
     image = _of("env", "image")
+    groups = _of("env", "groups")
     masked = _of("env", "masked")
     reward_shapes = _of("env", "reward_shapes")
     obs_dtype = _of("env", "obs_dtype")

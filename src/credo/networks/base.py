@@ -12,7 +12,7 @@ matrix products.
 import abc
 import itertools
 import math
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import equinox as eqx
 import jax
@@ -100,6 +100,11 @@ class AbstractNetwork(eqx.Module):
         sizes = (self.least, 1, *(2,) * self.team)
         first = jax.eval_shape(lambda: self.init(*sizes, key=jax.random.key(0)).first())
         return first is not None
+
+    def fitted(self, env: Any) -> Self:
+        """With what only a task knows, where it is not given: where its image is, which of its
+        agents are alike. It opens a task outside JAX."""
+        return self
 
     @abc.abstractmethod
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray) -> AbstractPolicy:

@@ -12,7 +12,8 @@ closer look at invalid action masking in policy gradient algorithms").
 """
 
 import itertools
-from typing import Any
+from dataclasses import replace
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -35,6 +36,9 @@ class Choosing(AbstractNetwork):
     @property
     def team(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.network.team
+
+    def fitted(self, env: Any) -> Self:
+        return replace(self, network=self.network.fitted(env))
 
     @property
     def least(self) -> int:

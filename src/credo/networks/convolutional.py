@@ -33,7 +33,7 @@ class Convolutional(AbstractNetwork):
     """What acts on the flattened output of the last convolution, and on what stands beside the
     image."""
     shape: Shape | None = eqx.field(static=True, default=None)
-    """Height, width and channels of the image; None: `seeing` finds out."""
+    """Height, width and channels of the image; None: `fitted` finds out."""
     start: int = eqx.field(static=True, default=0)  # where the image begins in an observation, ≥ 0
     scale: float = eqx.field(static=True, default=1.0)
     """What the image's numbers are divided by, above 0: 255 of bytes."""
@@ -63,7 +63,7 @@ class Convolutional(AbstractNetwork):
                 f"head is {type(self.head).__name__}, which acts for a team: give a network of one"
             )
 
-    def seeing(self, env: Any) -> Self:
+    def fitted(self, env: Any) -> Self:
         """With the image of a task, where it is not given. It opens a task outside JAX.
 
         **Raises:** `ValueError` if the task's observations have no image.
@@ -86,7 +86,7 @@ class Convolutional(AbstractNetwork):
         """Of the image, and of what each layer says of it. Raises `ValueError` of filters that are
         larger than what they see."""
         if self.shape is None:
-            raise ValueError("shape is None: give height, width and channels, or use seeing(task)")
+            raise ValueError("shape is None: give height, width and channels, or use fitted(task)")
         shapes = [self.shape]
         for n, kernel, stride in zip(self.channels, self.kernels, self.strides, strict=True):
             height, width = ((size - kernel) // stride + 1 for size in shapes[-1][:2])

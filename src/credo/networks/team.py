@@ -5,7 +5,8 @@ Everything or nothing may be shared instead. And critics that see a whole team.
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal
+from dataclasses import replace
+from typing import Any, ClassVar, Literal, Self
 
 import equinox as eqx
 import jax
@@ -41,8 +42,12 @@ class Team(AbstractNetwork):
     """Units of each layer that agents share, at least 1."""
     head: AbstractNetwork = MLP(hidden=(), initializer="uniform")
     """What stands on the trunk: MLP, or a network with memory, such as MMU."""
-    sharing: Literal["trunk", "everything", "nothing"] = eqx.field(static=True, default="trunk")
-    """What agents share: trunk, everything or nothing."""
+    sharing: Literal["trunk", "everything", "nothing", "groups"] = eqx.field(
+        static=True, default="trunk"
+    )
+    """What agents share: trunk, everything or nothing; or everything with those of their group."""
+    groups: tuple[int, ...] = eqx.field(static=True, default=())
+    """The group of each agent, counted from 0, where `groups` share; `fitted` asks the task."""
     activation: str = eqx.field(static=True, default="tanh")  # activation of the trunk
     initializer: str = eqx.field(static=True, default="uniform")
     """Fresh weights of the trunk, as in MLP."""
@@ -59,8 +64,7 @@ class Team(AbstractNetwork):
     ) -> "TeamPolicy":
         trunk_key, head_key = jax.random.split(key)
         sizes = (obs_size, *self.trunk)
-        trunks = 1 if self.sharing != "nothing" else agents
-        heads = 1 if self.sharing == "everything" else agents
+        trunks, heads = self._numbers(agents)
         drawn = eqx.filter_vmap(lambda key: self.head.init(sizes[-1], action_size, key=key))(
             jax.random.split(head_key, heads)
         )
@@ -73,6 +77,22 @@ class Team(AbstractNetwork):
             self,
             agents,
         )
+
+    def fitted(self, env: Any) -> Self:
+        groups = env.groups if self.sharing == "groups" and not self.groups else self.groups
+        return replace(self, groups=tuple(groups))
+
+    def _numbers(self, agents: int) -> tuple[int, int]:
+        """Of trunks and of heads. Raises `ValueError` unless every agent has a group."""
+        if self.sharing == "groups":
+            kinds = set(self.groups)
+            if len(self.groups) != agents or kinds != set(range(len(kinds))):
+                raise ValueError(
+                    f"groups are {self.groups} of {agents} agents: give the group of each, counted "
+                    "from 0, or () and Team.fitted(task)"
+                )
+            return len(kinds), len(kinds)
+        return {"nothing": agents}.get(self.sharing, 1), {"everything": 1}.get(self.sharing, agents)
 
 
 class TeamPolicy(AbstractPolicy):
@@ -93,7 +113,7 @@ class TeamPolicy(AbstractPolicy):
         heads = tuple(head.arranged() for head in self.heads)
         if self.config.sharing == "nothing" and self.agents <= UNROLLED:
             return TeamPolicy(self.trunks, heads, self.config, self.agents, apart=True)
-        rows = (_rows(self.trunks), _rows(heads))
+        rows = (self._rows(self.trunks), self._rows(heads))
         return TeamPolicy(self.trunks, self.heads, self.config, self.agents, rows)
 
     def start(self, *, key: PRNGKeyArray) -> PyTree:
@@ -167,17 +187,20 @@ class TeamPolicy(AbstractPolicy):
     def _each(self, function, *rest: PyTree) -> PyTree:
         """`function(trunk, head, *rest)` for every agent. What is shared has no axis of agents, so
         that a layer is one matrix product for all."""
-        parts = self.rows or (_rows(self.trunks), _rows(self.heads))
+        parts = self.rows or (self._rows(self.trunks), self._rows(self.heads))
         axes = (
             None if len(one_of) == 1 else eqx.if_array(0) for one_of in (self.trunks, self.heads)
         )
         axes = (*axes, *(0 for _ in rest))
         return eqx.filter_vmap(function, in_axes=axes, axis_size=self.agents)(*parts, *rest)
 
-
-def _rows(one_of: tuple[PyTree, ...]) -> PyTree:
-    """What all agents share, or the parts of each with an axis of agents."""
-    return one_of[0] if len(one_of) == 1 else tree.stack(*one_of)
+    def _rows(self, one_of: tuple[PyTree, ...]) -> PyTree:
+        """What all agents share, or the parts of each with an axis of agents."""
+        if len(one_of) == 1:
+            return one_of[0]
+        if self.config.sharing == "groups":
+            one_of = tuple(one_of[group] for group in self.config.groups)
+        return tree.stack(*one_of)
 
 
 class Centralized(AbstractNetwork):
