@@ -22,6 +22,10 @@ KINDS = {  # those of PettingZoo need an extra
     kind: f"environments.{kind}:{name}"
     for kind, name in (("gymnasium", "Gymnasium"), ("pettingzoo", "PettingZoo"))
 }
+IN_JAX = {  # packages of tasks in JAX, which name theirs package:id
+    package: f"environments.{package}:{name}"
+    for package, name in (("brax", "Brax"), ("gymnax", "Gymnax"))
+}
 
 
 def task(name: str, kwargs: dict[str, Any], rewards: tuple[str, ...]) -> Any:
@@ -53,12 +57,12 @@ def with_settings(env: Any, kwargs: dict[str, Any], rewards: tuple[str, ...] = (
 
 
 def _named(name: str, kwargs: dict[str, Any]) -> Any:
-    """A task by the form of its name: a word of the catalogue, `module:Name`, the module of a team,
-    or an id of Gymnasium."""
+    """A task by the form of its name: a word of the catalogue, `package:id` of a package in JAX,
+    `module:Name`, the module of a team, or an id of Gymnasium."""
     if name in TASKS:
         return load(TASKS[name]["path"])()
-    if name.startswith("gymnax:"):
-        return _of_gymnax(name)
+    if name.partition(":")[0] in IN_JAX:
+        return _of_package(name)
     if re.fullmatch(r"\w+(\.\w+)*:\w+", name):
         return _own(name, kwargs)
     if re.fullmatch(r"\w+(\.\w+)+", name):
@@ -72,15 +76,12 @@ def _named(name: str, kwargs: dict[str, Any]) -> Any:
     return _registered(name)
 
 
-def _of_gymnax(name: str) -> Any:
-    """gymnax:CartPole-v1."""
+def _of_package(name: str) -> Any:
+    """gymnax:CartPole-v1, and the like of other packages of tasks in JAX."""
+    package, _, id = name.partition(":")
     try:
-        made = load("environments.gymnax:Gymnax")
-    except ModuleNotFoundError as error:
-        fail(str(error))
-    try:
-        return made(id=name.partition(":")[2])
-    except ValueError as error:
+        return load(IN_JAX[package])(id=id)
+    except (ModuleNotFoundError, ValueError) as error:
         fail(str(error))
 
 
@@ -123,6 +124,8 @@ def _own(name: str, kwargs: dict[str, Any]) -> Any:
 def require_sound(name: str, env: Any) -> None:
     """End with what is wrong with a task that is not ours, before anything is trained on it: one of
     the user's own is checked, one of a package is opened."""
+    if name.partition(":")[0] in IN_JAX:
+        return  # it was opened when it was named
     if ":" in name:
         if found := problems(env):
             say("\n".join(f"- {problem}" for problem in found))

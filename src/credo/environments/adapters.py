@@ -64,7 +64,7 @@ class Single:
             names.register(spec.get("registered"))
             return _registered(name or module, kwargs, spec["max_episode_steps"])
         maker = names.resolve(id, gymnasium.Env)
-        _hear_mujoco()
+        hear_mujoco()
         env = maker(**kwargs)
         if not isinstance(env, gymnasium.Env):
             raise Fault(f"is a {type(env).__name__}", "name what makes a gymnasium.Env")
@@ -539,11 +539,11 @@ def _registered(id: str, kwargs: dict[str, Any], max_episode_steps: int | None) 
             ) from error
         if isinstance(entry, str):
             importlib.import_module(entry.partition(":")[0])
-        _hear_mujoco()
+        hear_mujoco()
         return gymnasium.make(id, max_episode_steps, disable_env_checker=True, **kwargs)
 
 
-def _hear_mujoco() -> None:
+def hear_mujoco() -> None:
     """MuJoCo would write its warnings to a file in the working directory, once for every copy."""
     mujoco = sys.modules.get("mujoco")
     if mujoco is not None and mujoco.get_mju_user_warning() is None:
