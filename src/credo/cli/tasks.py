@@ -24,7 +24,12 @@ KINDS = {  # those of PettingZoo need an extra
 }
 IN_JAX = {  # packages of tasks in JAX, which name theirs package:id
     package: f"environments.{package}:{name}"
-    for package, name in (("brax", "Brax"), ("gymnax", "Gymnax"))
+    for package, name in (
+        ("brax", "Brax"),
+        ("gymnax", "Gymnax"),
+        ("jaxmarl", "JaxMARL"),
+        ("jumanji", "Jumanji"),
+    )
 }
 
 

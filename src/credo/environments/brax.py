@@ -6,10 +6,8 @@ Needs brax. It is compiled with its policies into one program, like a task of ou
 are not used: an episode ends where it ends, and `terminated` and `truncated` are told apart.
 """
 
-import contextlib
 import functools
 import importlib.util
-import io
 from collections.abc import Callable
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -20,14 +18,13 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from .. import require
 from ..types import TimeStep
+from . import others
 from .adapters import hear_mujoco
-from .base import AbstractEnvironment
-from .others import MOST_STEPS, flat, like, making, pairs, permissive
 
 if importlib.util.find_spec("brax") is None:
     raise ModuleNotFoundError("tasks of Brax need it: `pip install brax`")
 
-with permissive(), contextlib.redirect_stdout(io.StringIO()):  # MJX prints that it has no Warp
+with others.importing():
     from brax import envs  # pyright: ignore[reportMissingImports]
 
 
@@ -36,8 +33,7 @@ class _Made(NamedTuple):
 
     reset: Callable[[PRNGKeyArray], Any]
     step: Callable[[Any, Array], Any]
-    obs_size: int
-    action_size: int
+    form: others.Form
 
 
 @functools.cache
@@ -46,15 +42,15 @@ def _made(id: str, backend: str, settings: tuple[tuple[str, Any], ...]) -> _Made
     of one that fails with the JAX that is here, as does the swimmer of Brax 0.14."""
     hear_mujoco()
     try:
-        with making():
+        with others.making():
             env = envs.get_environment(id, backend=backend, **dict(settings))
-            made = _Made(jax.jit(env.reset), jax.jit(env.step), 0, int(env.action_size))
-        with permissive():
-            state = jax.eval_shape(made.reset, jax.random.key(0))
-            obs = jax.eval_shape(made.step, state, jnp.zeros(made.action_size)).obs
+            reset, step, size = jax.jit(env.reset), jax.jit(env.step), int(env.action_size)
+        with others.permissive():
+            state = jax.eval_shape(reset, jax.random.key(0))
+            obs = jax.eval_shape(step, state, jnp.zeros(size)).obs
     except TypeError as error:
         raise ValueError(f"{id} was not made: {error}") from error
-    return made._replace(obs_size=obs.shape[-1])
+    return _Made(reset, step, others.Form(obs.shape[-1], size))
 
 
 class BraxState(eqx.Module):
@@ -64,27 +60,22 @@ class BraxState(eqx.Module):
     step: Int[Array, ""]
 
 
-class Brax(AbstractEnvironment):
+class Brax(others.AbstractOther):
     """A task of `brax.envs`. The one signal is `reward`. Its `done` terminates an episode, and the
-    clock truncates it."""
+    clock, of 1,000 steps, truncates it."""
 
     signals: ClassVar[tuple[str, ...]] = ("reward",)
 
-    id: str = eqx.field(static=True)  # as in brax.envs, such as halfcheetah
     backend: Literal["generalized", "mjx", "positional", "spring"] = eqx.field(
         static=True, default="generalized"
     )
     """The physics. `generalized`, Brax's own default, moves joints by their angles; so does `mjx`,
     MuJoCo's, the slowest on a CPU. `positional` and `spring` move bodies that joints pull together,
     with other time steps and gears: policies and returns of one backend are none of another."""
-    kwargs: tuple[tuple[str, Any], ...] = eqx.field(static=True, converter=pairs, default=())
-    """Settings of the environment by name, such as ctrl_cost_weight; others stay."""
-    max_episode_steps: int = eqx.field(static=True, default=MOST_STEPS)  # at least 1
 
     def __check_init__(self):
         require.literals(self)
         require.choice("id", self.id, envs._envs)
-        require.at_least("max_episode_steps", self.max_episode_steps, 1)
         _ = self._made
 
     @property
@@ -92,30 +83,22 @@ class Brax(AbstractEnvironment):
         return _made(self.id, self.backend, self.kwargs)
 
     @property
-    def obs_size(self) -> int:
-        return self._made.obs_size
-
-    @property
-    def action_size(self) -> int:
-        return self._made.action_size
-
-    @property
-    def max_steps(self) -> int:
-        return self.max_episode_steps
+    def form(self) -> others.Form:
+        return self._made.form
 
     def reset(self, *, key: PRNGKeyArray) -> tuple[BraxState, TimeStep]:
-        with permissive():
+        with others.permissive():
             inner = self._made.reset(key)
         inner, no = jax.tree.map(jnp.asarray, inner), jnp.bool_(False)
-        now = TimeStep(flat(inner.obs), {"reward": jnp.float32(0.0)}, no, no)
+        now = TimeStep(others.flat(inner.obs), {"reward": jnp.float32(0.0)}, no, no)
         return BraxState(inner, jnp.int32(0)), now
 
     def step(
         self, state: BraxState, action: Float[Array, " act"], *, key: PRNGKeyArray
     ) -> tuple[BraxState, TimeStep]:
-        with permissive():
-            inner = like(self._made.step(state.inner, action), state.inner)
+        with others.permissive():
+            inner = others.like(self._made.step(state.inner, action), state.inner)
         state = BraxState(inner, state.step + 1)
         rewards = {"reward": inner.reward.astype(jnp.float32)}
-        now = TimeStep(flat(inner.obs), rewards, inner.done > 0.5, jnp.bool_(False))
-        return state, now.cut(state.step >= self.max_episode_steps)
+        now = TimeStep(others.flat(inner.obs), rewards, inner.done > 0.5, jnp.bool_(False))
+        return state, now.cut(state.step >= self.max_steps)

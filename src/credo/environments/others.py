@@ -1,14 +1,25 @@
-"""What adapters of other people's JAX environments have in common."""
+"""What adapters of other people's JAX environments have in common.
 
+Their automatic resets are not used: an episode ends where it ends, and `terminated` and `truncated`
+are told apart.
+"""
+
+import abc
 import contextlib
+import io
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .. import require
+from .base import AbstractEnvironment
 
 MOST_STEPS = 1000  # of an episode, where neither the environment nor its user names a limit
 
@@ -33,6 +44,20 @@ def making() -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def importing() -> Iterator[None]:
+    """Others' packages, some of which print what else they could not find. JaxMARL also sets both
+    streams to those that the process began with."""
+    streams = {name: getattr(sys, name) for name in ("stdout", "stderr", "__stdout__")}
+    sys.stdout = sys.__stdout__ = io.StringIO()  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        with permissive():
+            yield
+    finally:
+        for name, stream in streams.items():
+            setattr(sys, name, stream)
+
+
 def pairs(settings: Any) -> tuple[tuple[str, Any], ...]:
     """Settings by name in one order, that can be hashed; lists in them become tuples."""
     return tuple((name, _frozen(x)) for name, x in sorted(dict(settings).items()))
@@ -43,8 +68,13 @@ def _frozen(x: Any) -> Any:
 
 
 def like(new: PyTree, old: PyTree) -> PyTree:
-    """A tree of numbers as arrays of the dtypes of another one."""
-    return jax.tree.map(lambda x, y: jnp.asarray(x, jnp.asarray(y).dtype), new, old)
+    """A tree of numbers and random keys as arrays of the dtypes of another one."""
+
+    def cast(x: Any, y: Any) -> Any:
+        dtype = jnp.asarray(y).dtype
+        return x if jnp.issubdtype(dtype, jax.dtypes.prng_key) else jnp.asarray(x, dtype)
+
+    return jax.tree.map(cast, new, old)
 
 
 def flat(x: PyTree) -> Float[Array, " n"]:
@@ -69,3 +99,60 @@ def chosen(
     ends = np.cumsum(choices)
     parts = [options[end - n : end] for n, end in zip(choices, ends, strict=True)]
     return jnp.stack([jnp.argmax(part) for part in parts])
+
+
+class Form(NamedTuple):
+    """What all episodes of an environment have in common."""
+
+    obs_size: int  # of the largest observation, without a mask
+    action_size: int
+    choices: tuple[int, ...] = ()
+    masked: bool = False
+    max_steps: int = MOST_STEPS
+
+
+class AbstractOther(AbstractEnvironment):
+    """A task of another package in JAX, by its name there.
+
+    Of discrete actions the largest number is taken, of those that are allowed. Where not all are,
+    every observation begins with a mask of them, 1 for what is allowed and 0 else.
+    """
+
+    id: str = eqx.field(static=True)  # as its package names it
+    kwargs: tuple[tuple[str, Any], ...] = eqx.field(static=True, converter=pairs, default=())
+    """Settings of the environment by name; others stay."""
+    max_episode_steps: int | None = eqx.field(static=True, default=None)
+    """A limit below the environment's own, at least 1; None: that one, or 1,000 without one."""
+
+    def __check_init__(self):
+        require.at_least("max_episode_steps", self.max_episode_steps, 1)
+
+    @property
+    @abc.abstractmethod
+    def form(self) -> Form:
+        """Its sizes. `ValueError` where it cannot be made."""
+
+    @property
+    def choices(self) -> tuple[int, ...]:
+        """Options of every discrete part of an action; (): it has none."""
+        return self.form.choices
+
+    @property
+    def discrete(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return bool(self.choices)
+
+    @property
+    def masked(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.form.masked
+
+    @property
+    def obs_size(self) -> int:
+        return self.form.obs_size + sum(self.choices) * self.masked
+
+    @property
+    def action_size(self) -> int:
+        return self.form.action_size
+
+    @property
+    def max_steps(self) -> int:
+        return min(self.max_episode_steps or self.form.max_steps, self.form.max_steps)
