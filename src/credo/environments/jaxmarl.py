@@ -59,7 +59,7 @@ def _made(id: str, settings: tuple[tuple[str, Any], ...]) -> _Made:
             if getattr(env, "auto_reset", False):  # those of Brax
                 env = jaxmarl.make(id, **(given | {"auto_reset": False}))
         with others.permissive():
-            spaces = [env.action_space(name) for name in env.agents]
+            spaces: list[Any] = [env.action_space(name) for name in env.agents]
             obs, state = jax.eval_shape(env.reset, jax.random.key(0))
             size = max(jax.eval_shape(others.flat, obs[name]).size for name in env.agents)
             masks = _masks(env, spaces, state)
