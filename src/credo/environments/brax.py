@@ -71,7 +71,7 @@ class Brax(others.AbstractOther):
     )
     """The physics. `generalized`, Brax's own default, moves joints by their angles; so does `mjx`,
     MuJoCo's, the slowest on a CPU. `positional` and `spring` move bodies that joints pull together,
-    with other time steps and gears: policies and returns of one backend are none of another."""
+    mostly with other time steps and gears: policies and returns of one are none of another."""
 
     def __check_init__(self):
         require.literals(self)
