@@ -230,7 +230,7 @@ def test_a_team_is_told_by_its_config():
         ({"trunk": (5, 0)}, r"trunk\[1\] is 0: it must be at least 1"),
         (
             {"sharing": "heads"},
-            "sharing is 'heads': it must be one of everything, groups, nothing, trunk",
+            "sharing is 'heads': it must be one of everything, groups, nothing",
         ),
         ({"activation": "swish"}, "activation is 'swish'"),
         ({"initializer": "zeros"}, "initializer is 'zeros'.*uniform"),

@@ -8,6 +8,7 @@ own. Its automatic resets are not used: an episode ends where it ends, and `term
 """
 
 import functools
+import importlib.metadata
 import importlib.util
 from typing import Any, ClassVar
 
@@ -19,33 +20,38 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .. import require
 from ..types import TimeStep
+from . import others
 from .base import AbstractEnvironment
+
+
+def _old() -> str | None:
+    """The version of gymnax, if it is one that speaks otherwise."""
+    version = importlib.metadata.version("gymnax")
+    return version if version.startswith("0.") else None
+
 
 if importlib.util.find_spec("gymnax") is None:
     raise ModuleNotFoundError("tasks of gymnax need it: `pip install gymnax`")
 
-import gymnax  # pyright: ignore[reportMissingImports]
-from gymnax.environments import spaces  # pyright: ignore[reportMissingImports]
+if version := _old():
+    raise ModuleNotFoundError(
+        f"tasks of gymnax need 1.0 or later, and {version} is installed: `pip install -U gymnax`"
+    )
+
+with others.importing():
+    import gymnax  # pyright: ignore[reportMissingImports]
+    from gymnax.environments import spaces  # pyright: ignore[reportMissingImports]
 
 
 @functools.cache
 def _made(id: str, settings: tuple[tuple[str, Any], ...]) -> tuple[Any, Any]:
     """The environment, and its parameters with these settings."""
-    with _permissive():
+    with others.permissive():
         env, params = gymnax.make(id)
     known = [name for name in vars(params) if not name.startswith("_")]
     for name, _ in settings:
         require.choice("setting", name, known)
     return env, params.replace(**dict(settings))
-
-
-def _permissive():
-    """Others' code relies on dtypes and ranks that JAX may be told to refuse."""
-    return jax.numpy_dtype_promotion("standard")
-
-
-def _pairs(settings: Any) -> tuple[tuple[str, Any], ...]:
-    return tuple(sorted(dict(settings).items()))
 
 
 class Gymnax(AbstractEnvironment):
@@ -59,7 +65,7 @@ class Gymnax(AbstractEnvironment):
     signals: ClassVar[tuple[str, ...]] = ("reward",)
 
     id: str = eqx.field(static=True)  # as in gymnax.registered_envs, such as CartPole-v1
-    kwargs: tuple[tuple[str, Any], ...] = eqx.field(static=True, converter=_pairs, default=())
+    kwargs: tuple[tuple[str, Any], ...] = eqx.field(static=True, converter=others.pairs, default=())
     """Parameters of the environment by name, such as max_steps_in_episode; others stay."""
 
     def __check_init__(self):
@@ -105,7 +111,7 @@ class Gymnax(AbstractEnvironment):
         return int(self._params.max_steps_in_episode)
 
     def reset(self, *, key: PRNGKeyArray) -> tuple[PyTree, TimeStep]:
-        with _permissive():
+        with others.permissive():
             obs, state = self._env.reset_env(key, self._params)
         state, no = jax.tree.map(jnp.asarray, state), jnp.bool_(False)  # its clock is a plain 0
         return state, TimeStep(self._flat(obs), {"reward": jnp.float32(0.0)}, no, no)
@@ -113,7 +119,7 @@ class Gymnax(AbstractEnvironment):
     def step(
         self, state: PyTree, action: Float[Array, " act"], *, key: PRNGKeyArray
     ) -> tuple[PyTree, TimeStep]:
-        with _permissive():
+        with others.permissive():
             obs, state, reward, over, _ = self._env.step_env(
                 key, state, self._own(action), self._params
             )

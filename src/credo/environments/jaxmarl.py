@@ -25,9 +25,9 @@ if importlib.util.find_spec("jaxmarl") is None:
 
 with others.importing():
     import jaxmarl  # pyright: ignore[reportMissingImports]
-    from jaxmarl.environments import (
-        overcooked_layouts,  # pyright: ignore[reportMissingImports]
-        smax,  # pyright: ignore[reportMissingImports]
+    from jaxmarl.environments import (  # pyright: ignore[reportMissingImports]
+        overcooked_layouts,
+        smax,
     )
     from jaxmarl.environments.spaces import Box, Discrete  # pyright: ignore[reportMissingImports]
 
@@ -46,6 +46,7 @@ class _Made(NamedTuple):
     masks: Any  # of a state what it allows, by agent; None: it does not say
     clock: int  # the step with which its own clock ends an episode; 0: it has none
     form: others.Form
+    groups: tuple[int, ...]  # of agents whose spaces are alike
 
 
 @functools.cache
@@ -61,7 +62,7 @@ def _made(id: str, settings: tuple[tuple[str, Any], ...]) -> _Made:
         with others.permissive():
             spaces: list[Any] = [env.action_space(name) for name in env.agents]
             obs, state = jax.eval_shape(env.reset, jax.random.key(0))
-            size = max(jax.eval_shape(others.flat, obs[name]).size for name in env.agents)
+            seen = [jax.eval_shape(others.flat, obs[name]).size for name in env.agents]
             masks = _masks(env, spaces, state)
     except (AssertionError, IndexError, KeyError, TypeError) as error:
         raise ValueError(f"{id} was not made: {type(error).__name__}: {error}") from error
@@ -72,8 +73,11 @@ def _made(id: str, settings: tuple[tuple[str, Any], ...]) -> _Made:
     choices = (int(max(options)),) if options else ()
     width = sum(choices) or max(x.shape[0] for x in spaces)
     masked = bool(choices) and (masks is not None or len(options) > 1)
-    form = others.Form(size, width, choices, masked, steps)
-    return _Made(env, spaces, masks, clock, form)
+    form = others.Form(max(seen), width, choices, masked, steps)
+    acts = [getattr(x, "n", None) or x.shape[0] for x in spaces]
+    kinds = list(zip(seen, map(int, acts), strict=True))
+    groups = tuple(list(dict.fromkeys(kinds)).index(kind) for kind in kinds)
+    return _Made(env, spaces, masks, clock, form, groups)
 
 
 def _masks(env: Any, spaces: list[Any], state: Any) -> Any:
@@ -137,6 +141,10 @@ class JaxMARL(others.AbstractOther):
     @property
     def agents(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return len(self._made.spaces)
+
+    @property
+    def groups(self) -> tuple[int, ...]:
+        return self._made.groups
 
     def reset(self, *, key: PRNGKeyArray) -> tuple[TeamState, TimeStep]:
         with others.permissive():

@@ -27,7 +27,7 @@ MOST_STEPS = 1000  # of an episode, where neither the environment nor its user n
 @contextlib.contextmanager
 def permissive() -> Iterator[None]:
     """Others' code relies on dtypes and ranks that JAX may be told to refuse, and what it or its
-    packages deprecate concerns nobody here."""
+    packages deprecate is no concern here."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(jax.numpy_dtype_promotion("standard"))
         stack.enter_context(jax.numpy_rank_promotion("allow"))
@@ -133,13 +133,8 @@ class AbstractOther(AbstractEnvironment):
         """Its sizes. `ValueError` where it cannot be made."""
 
     @property
-    def choices(self) -> tuple[int, ...]:
-        """Options of every discrete part of an action; (): it has none."""
+    def choices(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.form.choices
-
-    @property
-    def discrete(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return bool(self.choices)
 
     @property
     def masked(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -147,7 +142,7 @@ class AbstractOther(AbstractEnvironment):
 
     @property
     def obs_size(self) -> int:
-        return self.form.obs_size + sum(self.choices) * self.masked
+        return self.form.obs_size + self.barrable
 
     @property
     def action_size(self) -> int:
