@@ -33,6 +33,7 @@ from ..evolution.crossover import NoCrossover, OnePointCrossover
 from ..evolution.extinction import Extinction
 from ..evolution.mutation import MatrixMutation
 from ..evolution.selection import rankable, ranking
+from ..evolution.strategies import Strategy
 from ..networks.base import AbstractNetwork
 from ..networks.mmu import MMU
 from ..normalization import Moments, frozen, play
@@ -154,6 +155,12 @@ class Neuroevolution(eqx.Module):
             extinction=Extinction(),
         )
         return cls(env, network, **evolving(breeder, {"test_episodes": 10}, overrides))
+
+    @classmethod
+    def es(cls, env: Environment, network: AbstractNetwork, **overrides) -> Self:
+        """An evolution strategy in place of a genetic algorithm: `Strategy()`, CMA-ES, or any
+        other `breeder`."""
+        return cls(env, network, **evolving(Strategy(), overrides))
 
     @classmethod
     def presets(cls) -> dict[str, Callable[..., Self]]:
