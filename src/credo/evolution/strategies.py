@@ -4,8 +4,8 @@ Source: Lange (2022), "evosax: JAX-based evolution strategies" (arXiv:2212.04180
 or later, `pip install 'credo[strategies]'`. A strategy is asked for a population and told its
 fitness, from which it moves the distribution that it draws from. evosax minimises, and is told the
 negative. Of its strategies those are here that see ranks alone, so that neither the scale of a
-fitness nor a NaN changes what they do, and that find the least of a sum of squares, which LM_MA_ES,
-Rm_ES and xNES of 0.3.2 do not.
+fitness nor a NaN changes what they do, and that find the least of a sum of squares at 6, 40 and 200
+weights alike, which LM_MA_ES, Rm_ES and xNES of 0.3.2 do not.
 
 Departures: the first mean is a newly drawn policy, not zero. A run's champion is the fittest member
 of a generation, not the mean. Actors of learners are refused: a strategy takes every member for a
