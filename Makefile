@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
+WORLDS = $(VENV)-worlds
+GYMNAX = $(VENV)-gymnax
 WORKERS ?= auto
 
 .PHONY: demo test test-all docs lint benchmark clean
@@ -24,8 +26,23 @@ test: $(VENV)/installed
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest --numprocesses $(WORKERS) -m "not slow"
 
-test-all: test
+test-all: test $(WORLDS)/installed $(GYMNAX)/installed
 	$(BIN)/python -m pytest --numprocesses $(WORKERS) -m slow
+	$(WORLDS)/bin/python -m pytest --numprocesses $(WORKERS) $(addprefix tests/environments/test_,brax.py jaxmarl.py jumanji.py) tests/evolution/test_strategies.py
+	$(GYMNAX)/bin/python -m pytest --numprocesses $(WORKERS) tests/environments/test_gymnax.py
+
+# Packages of tasks, and strategies, of others: in environments of their own, since they bring much with them. gymnax wants a
+# Gymnasium that is older than ours.
+$(WORLDS)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(WORLDS)
+	$(WORLDS)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[brax,jaxmarl,jumanji,strategies]' pytest pytest-xdist
+	@touch $@
+
+$(GYMNAX)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(GYMNAX)
+	grep -v '^gymnasium==' constraints.txt > $(GYMNAX)/constraints.txt
+	$(GYMNAX)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(GYMNAX)/constraints.txt --editable . 'gymnax>=1' six pytest pytest-xdist
+	@touch $@
 
 docs: $(VENV)/installed
 	$(BIN)/python -m sphinx -E -W --keep-going -b html docs build/docs
@@ -39,4 +56,4 @@ benchmark: $(VENV)/installed
 	$(BIN)/python -m benchmarks
 
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(WORLDS) $(GYMNAX) .pytest_cache .ruff_cache

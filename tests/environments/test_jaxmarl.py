@@ -1,13 +1,15 @@
 """Teams of JaxMARL: the numbers of its own steps and of our simple spread, masks, deaths, ends."""
 
 import dataclasses
+import importlib.util
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-pytest.importorskip("jaxmarl", reason="an extra: pip install credo[jaxmarl]")
+if importlib.util.find_spec("jaxmarl") is None:  # one that cannot be imported is no reason to skip
+    pytest.skip("an extra: pip install credo[jaxmarl]", allow_module_level=True)
 
 from credo import rollout
 from credo.environments import checks

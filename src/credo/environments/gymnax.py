@@ -38,9 +38,12 @@ if version := _old():
         f"tasks of gymnax need 1.0 or later, and {version} is installed: `pip install -U gymnax`"
     )
 
-with others.importing():
-    import gymnax  # pyright: ignore[reportMissingImports]
-    from gymnax.environments import spaces  # pyright: ignore[reportMissingImports]
+try:
+    with others.importing():
+        import gymnax  # pyright: ignore[reportMissingImports]
+        from gymnax.environments import spaces  # pyright: ignore[reportMissingImports]
+except ModuleNotFoundError as error:  # 1.0.1 does not name all that it imports
+    raise ModuleNotFoundError(f"gymnax needs {error.name}: `pip install {error.name}`") from error
 
 
 @functools.cache

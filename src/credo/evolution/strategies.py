@@ -64,9 +64,9 @@ class Strategy(AbstractBreeder):
     """Standard deviation of every weight in the first population, above 0. That of Open_ES
     stays."""
     learning_rate: float | None = eqx.field(static=True, default=None)
-    """Step size of Open_ES (Adam) and of PGPE (ClipUp, of which no step is longer than twice that),
-    above 0. None: of Open_ES std / 2, as Salimans et al. (2017) had it, of PGPE std·√weights / 30,
-    as Toklu et al. (2020) advise."""
+    """Step size of Open_ES (Adam) and of PGPE (ClipUp, Toklu et al. 2020, of which no step is
+    longer than twice that), above 0. None: of Open_ES std / 2, of PGPE a thirtieth of the first
+    sample's radius, std·√weights; the latter is a choice of ours."""
     settings: tuple[tuple[str, Any], ...] = eqx.field(static=True, converter=_pairs, default=())
     """Parameters of the strategy by evosax's names, such as std_lr=0.05 of PGPE; others stay."""
 
