@@ -104,8 +104,10 @@ class OffPolicy(eqx.Module):
 
     @classmethod
     def dqn(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
-        """Discrete actions: double Q-learning, with an update per frame."""
-        settings = in_windows(env, network, {"learner": DQN(), "start_frames": 1_000})
+        """Discrete actions: double Q-learning of returns of three steps, an update per frame. For a
+        network with memory, which learns from windows, they are of one step."""
+        settings: dict[str, Any] = {"learner": DQN(), "start_frames": 1_000}
+        settings = {"sampling": Sampling(steps=3)} | in_windows(env, network, settings)
         network = network or (DQN_NETWORK if env.agents is None else Team())
         return cls(env, choosing(env, network), **settings | overrides)
 
