@@ -13,6 +13,8 @@ NAMES = (
     "td3_update",
     "recurrent_update",
     "recurrent_ppo",
+    "ppo_jax",
+    "dqn",
     "erl_hopper",
     "rover_step",
     "maddpg_update",

@@ -6,7 +6,7 @@ import pathlib
 import subprocess
 from typing import Any
 
-PEERS = ("torch", "sb3", "sbx", "evorl", "vmas", "benchmarl", "neat")
+PEERS = ("torch", "sb3", "sbx", "evorl", "vmas", "benchmarl", "neat", "rejax")
 FOLDER = pathlib.Path(__file__).parent
 VARIABLES = {name: f"CREDO_PEER_{name.upper()}" for name in PEERS}
 

@@ -64,10 +64,7 @@ class _Group:
 
     def _nothing(self, part: Part) -> np.ndarray | None:
         """What they remember, as zeros."""
-        first = jax.eval_shape(
-            lambda arrays: eqx.filter_vmap(lambda one: one.first())(self._form.filled(arrays)),
-            self._arrays,
-        )
+        first = _first(self._form, tuple(x if x is None else _form_of(x) for x in self._arrays))
         if first is None:
             return None
         return np.zeros((part.worlds.size, *first.shape[1:]), first.dtype)
@@ -84,6 +81,19 @@ class _Group:
         given = (self._form, self._arrays, obs[self.lanes], self._carry, remembers)
         action, self._carry, self.memory = act(*given)
         return action
+
+
+def _form_of(x: Array) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(x.shape, x.dtype)
+
+
+@functools.lru_cache(maxsize=256)  # to find out takes as long as to play twenty steps
+def _first(
+    form: "Form", arrays: tuple[jax.ShapeDtypeStruct | None, ...]
+) -> jax.ShapeDtypeStruct | None:
+    """The form of what a population remembers at the start of an episode."""
+    first = eqx.filter_vmap(lambda one: one.first())
+    return jax.eval_shape(lambda arrays: first(form.filled(list(arrays))), arrays)
 
 
 def play(parts: Sequence[Part]) -> list[Outcome]:
