@@ -13,12 +13,14 @@ from walk import HostWalk
 from credo.algorithms.ppo import PPO, Actor, Choice, Sample, advantages, improve, prepare, surrogate
 from credo.compilation import jit
 from credo.environments.passive_tmaze import PassiveTMaze
-from credo.environments.probes import Copy
+from credo.environments.probes import Copy, Meet
 from credo.learners.base import act
 from credo.networks.choosing import Choosing
 from credo.networks.exploration import Categorical
 from credo.networks.mlp import MLP, Critic
 from credo.networks.recurrent import Recurrent
+from credo.networks.team import Team
+from credo.replay import Replay
 
 SMALL = {
     "network": MLP(hidden=(8,), initializer="fan_in", output_scale=0.01),
@@ -100,6 +102,70 @@ def test_copy_is_learned(trained):
     first, last = (float(metrics["champion_score"]) for metrics in (history[0], history[-1]))
     assert first < -2.0  # doing nothing earns -3.3
     assert last > -0.6
+
+
+@pytest.fixture(scope="module")
+def team():
+    """PPO of a team, two agents that meet, after three generations."""
+    ppo = PPO.ppo(Meet(), horizon=64, copies=16, batch_size=16, signal="local")
+    state, generation = ppo.init(key=jax.random.key(0)), jit(ppo.generation)
+    for i in range(3):
+        state, _ = generation(state, key=jax.random.key(i))
+    return ppo, state
+
+
+def test_each_agent_of_a_team_has_its_own_advantages(team):
+    """Those of an agent alone with its own rewards; of one that ended or does not act, none."""
+    ppo, state = team
+    n = int(state.replay.size)
+    rows = state.replay.data
+    gone = jnp.arange(len(rows.obs)) % 5 == 2
+    active = jnp.ones((len(rows.obs), 2), bool).at[:, 1].set(~(jnp.arange(len(rows.obs)) % 5 == 3))
+    ended = jnp.stack([rows.terminated, rows.terminated | gone], axis=1)
+    replay = Replay(dataclasses.replace(rows, terminated=ended, active=active), state.replay.size)
+    sample = prepare(ppo, (state.actor, state.critic), replay)
+    np.testing.assert_array_equal(sample.counts[:n], active[:n])
+    seen = np.zeros((n, 2))
+    for agent in (0, 1):
+        value = lambda x: np.asarray(state.critic(x[:n, agent].T, jnp.zeros((0, n))))  # noqa: E731, B023
+        now, after = value(rows.obs), value(rows.next_obs)
+        end, over = np.asarray(ended[:n, agent]), np.asarray(ended[:n, agent] | rows.truncated[:n])
+        delta = np.asarray(rows.rewards["local"][:n, agent]) + 0.99 * np.where(end, 0, after) - now
+        for i in reversed(range(n)):
+            on = i + 1 < n and not over[i] and bool(active[i + 1, agent])
+            seen[i, agent] = delta[i] + (0.99 * 0.95 * seen[i + 1, agent] if on else 0.0)
+        expected = seen[:, agent] + now
+        np.testing.assert_allclose(sample.value[:n, agent], expected, rtol=1e-3, atol=1e-4)
+    counted = seen[np.asarray(active[:n])]
+    normal = (seen - counted.mean()) / counted.std()
+    np.testing.assert_allclose(sample.advantage[:n], normal, rtol=1e-3, atol=2e-3)
+
+
+def test_what_an_agent_that_does_not_act_said_changes_nothing(team):
+    ppo, state = team
+    rows = state.replay.data
+    active = jnp.ones((len(rows.obs), 2), bool).at[::3, 0].set(False)
+    losses = []
+    for noise in (0.0, 5.0):
+        action = jnp.where(active[..., None], rows.action, rows.action + noise)
+        replay = Replay(dataclasses.replace(rows, action=action, active=active), state.replay.size)
+        sample = prepare(ppo, (state.actor, state.critic), replay)
+        losses.append(surrogate(ppo, (state.actor, state.critic), sample)[0])
+    assert float(losses[0]) == pytest.approx(float(losses[1]), abs=1e-6)
+
+
+def test_a_team_learns_to_meet(team):
+    ppo, state = team
+    ppo = dataclasses.replace(ppo, learning_rate=3e-3, test_every=200)
+    generation = jit(ppo.generation)
+    for i in range(30):
+        state, metrics = generation(state, key=jax.random.key(100 + i))
+    assert float(metrics["champion_score"]) == 1.0
+
+
+def test_a_team_with_memory_is_refused():
+    with pytest.raises(ValueError, match="acts for a team and has memory: PPO learns for teams wi"):
+        PPO.ppo(Meet(), Team(head=Recurrent("gru", 4)))
 
 
 def test_no_update_leaves_the_networks_alone(trained):

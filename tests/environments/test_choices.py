@@ -216,6 +216,14 @@ def test_a_team_chooses_and_learns_each_for_itself(where, kind):
         assert set(paid.values()) <= {0.0, 1.0}
 
 
+def test_a_team_that_is_masked_learns_by_ppo():
+    env = task("Team", PettingZoo)
+    settings = {"horizon": 100, "copies": 20, "batch_size": 20, "learning_rate": 3e-3}
+    rows, _ = trained(PPO.ppo(env, signal="local", **settings), 25, eager)
+    assert rows[-1]["champion_score"] >= 4.5  # of 5
+    assert rows[0]["fitness_mean"] < 4.0
+
+
 @pytest.mark.parametrize("sharing", ["trunk", "everything", "nothing"])
 def test_a_team_in_jax_says_what_its_heads_say(sharing):
     network = TeamNetwork((6,), Recurrent("gru", 3), sharing)

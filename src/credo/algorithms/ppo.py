@@ -6,9 +6,14 @@ need (at most `copies`), so that its end is a state to resume from. Rewards are 
 normalised, and observations only with `normalize_observations`; most implementations do both in
 silence. The
 clipped gradient, the first deviation and the tanh around the mean are not the paper's.
+
+A team's agents learn independently (de Witt et al. 2020, "Is independent learning all you need in
+the StarCraft multi-agent challenge?"): each by its own observations, with a critic that all share.
+Who does not act is not learned from.
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, Self
@@ -22,11 +27,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from .. import require, tree
 from ..compilation import float32, jit
 from ..learners.base import act, adam, adam_state, averaged, mean, said_at_once, windows_of
-from ..networks.base import AbstractNetwork, AbstractPolicy
+from ..networks.base import AbstractNetwork, AbstractPolicy, features_first
 from ..networks.choosing import choosing, chosen
 from ..networks.exploration import Categorical, Explorer, GaussianNoise
 from ..networks.history import HistoryCriticNetwork, remembering, through
 from ..networks.mlp import MLP, AbstractCriticNetwork, Critic
+from ..networks.team import Team
 from ..normalization import Moments, behind, frozen, seen, warmed, watched
 from ..replay import Replay, extend
 from ..rollout import Environment, blank, collect
@@ -34,6 +40,9 @@ from ..types import Metrics, Transition
 from .fitness import objective, retested
 
 NETWORK = MLP(hidden=(64, 64), activation="tanh", initializer="fan_in", output_scale=0.01)
+TEAM_NETWORK = Team(
+    trunk=(64, 64), head=MLP((), initializer="uniform", output_scale=0.01), sharing="everything"
+)
 METRICS = ("policy_loss", "critic_loss", "clipped")
 
 
@@ -44,27 +53,28 @@ class Actor(eqx.Module):
     log_std: Float[Array, " act"]
 
     def log_density(
-        self, mean: Float[Array, "batch act"], action: Float[Array, "batch act"]
-    ) -> Float[Array, " batch"]:
-        z = (action - mean) / jnp.exp(self.log_std)[None]
-        each = -0.5 * jnp.square(z) - self.log_std[None] - 0.5 * jnp.log(2.0 * jnp.pi)
-        return jnp.sum(each, axis=1)
+        self, mean: Float[Array, "*batch act"], action: Float[Array, "*batch act"]
+    ) -> Float[Array, "*batch"]:
+        log_std = self.log_std.reshape((1,) * (mean.ndim - 1) + (-1,))
+        z = (action - mean) / jnp.exp(log_std)
+        each = -0.5 * jnp.square(z) - log_std - 0.5 * jnp.log(2.0 * jnp.pi)
+        return jnp.sum(each, axis=-1)
 
-    def entropy(self, mean: Float[Array, "batch act"]) -> Float[Array, " batch"]:
+    def entropy(self, mean: Float[Array, "*batch act"]) -> Float[Array, "*batch"]:
         each = self.log_std + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e)
-        return jnp.broadcast_to(jnp.sum(each), mean.shape[:1])
+        return jnp.broadcast_to(jnp.sum(each), mean.shape[:-1])
 
     def says(self, policy: AbstractPolicy) -> Callable[..., Any]:
         """What `log_density` takes, step by step: actions."""
         return policy
 
-    def told(self, obs: Float[Array, "rows obs"]) -> Float[Array, "rows act"]:
+    def told(self, obs: Float[Array, "rows *agents obs"]) -> Float[Array, "rows *agents act"]:
         """The same of a policy without memory, for a batch."""
         return act(self.mean, obs)
 
-    def explorer(self, size: int) -> AbstractPolicy:
-        """Who plays, for actions of so many numbers."""
-        std: Any = jnp.exp(self.log_std)
+    def explorer(self, size: int | tuple[int, ...]) -> AbstractPolicy:
+        """Who plays, for actions of this shape."""
+        std: Any = jnp.broadcast_to(jnp.exp(self.log_std), size)
         return Explorer(self.mean, GaussianNoise(std), jnp.bool_(False), size, clipped=False)
 
 
@@ -76,21 +86,22 @@ class Choice(eqx.Module):
     mean: AbstractPolicy  # whose largest outputs are the likeliest options
 
     def log_density(
-        self, said: Float[Array, "batch act"], action: Float[Array, "batch act"]
-    ) -> Float[Array, " batch"]:
+        self, said: Float[Array, "*batch act"], action: Float[Array, "*batch act"]
+    ) -> Float[Array, "*batch"]:
         each = []
         for part, done in zip(self._parts(said), self._parts(action), strict=True):
-            taken = jnp.argmax(done, axis=1, keepdims=True)
-            log_p = jax.nn.log_softmax(part, axis=1)
-            each.append(jnp.take_along_axis(log_p, taken, axis=1)[:, 0])
+            taken = jnp.argmax(done, axis=-1, keepdims=True)
+            log_p = jax.nn.log_softmax(part, axis=-1)
+            each.append(jnp.take_along_axis(log_p, taken, axis=-1)[..., 0])
         return functools.reduce(jnp.add, each)
 
-    def entropy(self, said: Float[Array, "batch act"]) -> Float[Array, " batch"]:
-        log_p = [jax.nn.log_softmax(part, axis=1) for part in self._parts(said)]
-        return functools.reduce(jnp.add, [-jnp.sum(jnp.exp(p) * p, axis=1) for p in log_p])
+    def entropy(self, said: Float[Array, "*batch act"]) -> Float[Array, "*batch"]:
+        log_p = [jax.nn.log_softmax(part, axis=-1) for part in self._parts(said)]
+        return functools.reduce(jnp.add, [-jnp.sum(jnp.exp(p) * p, axis=-1) for p in log_p])
 
-    def _parts(self, x: Float[Array, "batch act"]) -> list[Float[Array, "batch options"]]:
-        return [part.T for part in chosen(self.mean).parts(x.T)]
+    def _parts(self, x: Float[Array, "*batch act"]) -> list[Float[Array, "*batch options"]]:
+        ends = itertools.accumulate(chosen(self.mean).choices[:-1])
+        return jnp.split(x, list(ends), axis=-1)
 
     def says(self, policy: AbstractPolicy) -> Callable[..., Any]:
         def step(obs, carry):
@@ -99,10 +110,10 @@ class Choice(eqx.Module):
 
         return step
 
-    def told(self, obs: Float[Array, "rows obs"]) -> Float[Array, "rows act"]:
-        return said_at_once(self.mean, obs)[1].T
+    def told(self, obs: Float[Array, "rows *agents obs"]) -> Float[Array, "rows *agents act"]:
+        return jnp.moveaxis(said_at_once(self.mean, obs)[1], 0, -1)
 
-    def explorer(self, size: int) -> AbstractPolicy:
+    def explorer(self, size: int | tuple[int, ...]) -> AbstractPolicy:
         return Categorical(self.mean)
 
 
@@ -112,12 +123,12 @@ Networks = tuple[Actor | Choice, AbstractCriticNetwork]
 class Sample(eqx.Module):
     """What an update learns from, one row per frame."""
 
-    obs: Float[Array, "rows obs"]
-    action: Float[Array, "rows act"]
-    log_density: Float[Array, " rows"]  # of the action when it was drawn
-    advantage: Float[Array, " rows"]
-    value: Float[Array, " rows"]  # what the critic should have said
-    counts: Bool[Array, " rows"] | None = None  # which are frames; None: all
+    obs: Float[Array, "rows *agents obs"]
+    action: Float[Array, "rows *agents act"]
+    log_density: Float[Array, "rows *agents"]  # of the action when it was drawn
+    advantage: Float[Array, "rows *agents"]
+    value: Float[Array, "rows *agents"]  # what the critic should have said
+    counts: Bool[Array, "rows *agents"] | None = None  # which are frames, of who acts; None: all
     begins: Bool[Array, " rows"] | None = None
     """Of networks with memory: where an episode begins; and what they remembered before each row.
     """
@@ -142,7 +153,7 @@ class PPO(eqx.Module):
     """Train a policy on its own fresh experience alone."""
 
     default_budget: ClassVar[dict[str, int]] = {"frames": 1_000_000}
-    teams: ClassVar[bool] = False
+    teams: ClassVar[bool] = True
     discrete: ClassVar[bool] = True  # and others too
 
     env: Environment
@@ -192,13 +203,19 @@ class PPO(eqx.Module):
         ):
             require.at_least(name, getattr(self, name), 0)
         objective(self.env, self.signal)
+        if self.network.team and self.network.remembers:
+            raise ValueError(
+                f"{require.named(self.network)} acts for a team and has memory: PPO learns for "
+                "teams without memory; give MLP heads, or train it by merl, matd3, ccea"
+            )
 
     @classmethod
     def ppo(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """The constants of its authors for MuJoCo, and what the paper leaves open. For a network
         with memory minibatches hold 8 windows, of whole episodes where those are short."""
-        given: dict[str, Any] = {"network": choosing(env, network or NETWORK)}
-        if network is not None and network.remembers:
+        network = network or (NETWORK if env.agents is None else TEAM_NETWORK)
+        given: dict[str, Any] = {"network": choosing(env, network)}
+        if network.remembers:
             window = windows_of(env).window
             given |= {"window": window, "batch_size": 8 * window}
         return cls(env, **given | overrides)
@@ -215,7 +232,7 @@ class PPO(eqx.Module):
         if env.choices:
             require.choices(env, self.network, self)
         actor_key, critic_key = jax.random.split(key)
-        mean = self.network.init(env.obs_size, env.action_size, key=actor_key)
+        mean = self.network.init(*env.sizes, key=actor_key)
         std = jnp.full(env.action_size, jnp.log(self.first_std))
         actor = Choice(mean) if env.discrete else Actor(mean, std)
         values = self.critic if mean.first() is None else remembering(self.critic)
@@ -242,7 +259,8 @@ class PPO(eqx.Module):
 
         # Run the policy for about T frames.
         wanted = jnp.clip(jnp.ceil(self.horizon / state.length).astype(jnp.int32), 1, self.copies)
-        explorer = state.actor.explorer(self.env.action_size)
+        _, size, *team = self.env.sizes
+        explorer = state.actor.explorer((*team, size) if team else size)
         explorer = behind(state.moments, tree.single(explorer))
         how = {"wanted": wanted, "common": False, "key": explore_key}
         played, experience = collect(self.env, explorer, self.copies, **how)
@@ -262,7 +280,7 @@ class PPO(eqx.Module):
         due = frames // self.test_every > state.frames // self.test_every
         due = due | (state.score == -jnp.inf)
         score = retested(self.env, champion, self.test_episodes, due, state.score, key=test_key)
-        returns = played.returns[objective(self.env, self.signal)][0]
+        returns = played.of(objective(self.env, self.signal))[0]
         length = new.astype(jnp.float32) / wanted.astype(jnp.float32)
         metrics |= {
             "fitness_max": jnp.max(jnp.where(jnp.arange(self.copies) < wanted, returns, -jnp.inf)),
@@ -331,7 +349,12 @@ def prepare(ppo: PPO, networks: Networks, replay: Replay, moments: Moments | Non
     filled = jnp.arange(replay.capacity) < replay.size
     reward = rows.rewards[objective(ppo.env, ppo.signal)]
     obs, next_obs = seen(moments, rows.obs), seen(moments, rows.next_obs)
-    over = rows.terminated | rows.truncated
+    reward, terminated, truncated = (
+        _by_agent(x, rows) for x in (reward, rows.terminated, rows.truncated)
+    )
+    over = terminated | truncated
+    if rows.obs.ndim > 2:
+        filled = _by_agent(filled, rows) & (rows.active if rows.active is not None else True)
     before: Any = {"counts": filled}
     if rows.memory is not None:
         begins = jnp.append(True, over[:-1])
@@ -339,11 +362,11 @@ def prepare(ppo: PPO, networks: Networks, replay: Replay, moments: Moments | Non
         before |= {"begins": begins, "memories": memories}
     else:
         means, value, after = actor.told(obs), _value(critic, obs), _value(critic, next_obs)
-    delta = reward + ppo.gamma * jnp.where(rows.terminated, 0.0, after) - value
+    delta = reward + ppo.gamma * jnp.where(terminated, 0.0, after) - value
     # Rows come episode by episode.
-    goes_on = ~over & jnp.append(filled[1:], False)
+    goes_on = ~over & jnp.concatenate([filled[1:], jnp.zeros_like(filled[:1])])
     advantage = advantages(delta, goes_on, ppo.gamma * ppo.gae)
-    n = jnp.maximum(replay.size, 1).astype(jnp.float32)
+    n = jnp.maximum(jnp.sum(filled), 1).astype(jnp.float32)
     average = jnp.sum(jnp.where(filled, advantage, 0.0)) / n
     variance = jnp.sum(jnp.where(filled, jnp.square(advantage - average), 0.0)) / n
     return Sample(
@@ -356,9 +379,15 @@ def prepare(ppo: PPO, networks: Networks, replay: Replay, moments: Moments | Non
     )
 
 
+def _by_agent(x: Array, rows: Transition) -> Array:
+    """What is said of a frame, or of its agents each, of each."""
+    shape = rows.obs.shape[:-1]
+    return jnp.broadcast_to(x.reshape(x.shape + (1,) * (len(shape) - x.ndim)), shape)
+
+
 def advantages(
-    delta: Float[Array, " rows"], goes_on: Bool[Array, " rows"], decay: Any
-) -> Float[Array, " rows"]:
+    delta: Float[Array, "rows *agents"], goes_on: Bool[Array, "rows *agents"], decay: Any
+) -> Float[Array, "rows *agents"]:
     """A_t = δ_t + γλ A_{t+1}, up to the end of each episode."""
 
     def back(later, row):
@@ -366,7 +395,7 @@ def advantages(
         now = δ + decay * jnp.where(more, later, 0.0)
         return now, now
 
-    return jax.lax.scan(back, jnp.float32(0.0), (delta, goes_on), reverse=True)[1]
+    return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, goes_on), reverse=True)[1]
 
 
 def surrogate(ppo: PPO, networks: Networks, rows: Sample) -> tuple[Float[Array, ""], Metrics]:
@@ -450,5 +479,7 @@ def _value_of(critic: HistoryCriticNetwork, told: Array, obs: Array) -> Float[Ar
     return _value(critic.critic, jnp.concatenate([told, obs], axis=1))
 
 
-def _value(critic: AbstractCriticNetwork, obs: Float[Array, "rows obs"]) -> Float[Array, " rows"]:
-    return critic(obs.T, jnp.zeros((0, obs.shape[0])))
+def _value(
+    critic: AbstractCriticNetwork, obs: Float[Array, "rows *agents obs"]
+) -> Float[Array, "rows *agents"]:
+    return critic(features_first(obs), jnp.zeros((0, *obs.shape[:-1])))
