@@ -63,7 +63,7 @@ def fits(env: Any, network: Any, *learners: Any) -> None:
     team = env.agents is not None
     unfit = [learner for learner in learners if team and not learner.teams]
     if unfit:
-        has, instead = f"{env.agents} agents", "Teams learn by TD3 (credo train merl, matd3)"
+        has, instead = f"{env.agents} agents", "Teams learn by TD3 (credo train merl, matd3), PPO"
         raise ValueError(_cannot_learn(env, has, instead, unfit))
     made = getattr(network, "choices", None)
     if made is not None and (made, network.masked) != (tuple(env.choices), env.masked):
@@ -95,7 +95,7 @@ def choices(env: Any, network: Any, learner: Any, single: bool = False) -> None:
         others = "Give a task that has the one or the other"
         raise ValueError(_cannot_learn(env, "choices beside a Box", others, [learner]))
     if not learner.discrete:
-        others = "Give DQN (credo train dqn, erl, cerl, merl), or train one agent by ppo"
+        others = "Give DQN or DiscreteSAC (credo train dqn, sac, erl, cerl, merl), or PPO (ppo)"
         raise ValueError(_cannot_learn(env, "Discrete actions", others, [learner]))
     if single and len(env.choices) > 1:
         others = "Train it by ppo"

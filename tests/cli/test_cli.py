@@ -1081,7 +1081,6 @@ def test_list_shows_what_teams_need(credo):
     ("words", "told"),
     [
         ("train sac rover", "Rover has 6 agents: SAC cannot learn that. Teams learn by TD3"),
-        ("train ppo rover", "Rover has 6 agents: PPO cannot learn that. Teams learn by TD3"),
         ("train cerl rover", "MLP acts for one agent and Rover has 6"),
         ("train neuroevolution Pendulum-v1 --network dmmu", "DMMU acts for a team and Pendulum-v1"),
         ("train matd3 Pendulum-v1", "trains teams and Pendulum-v1 has one agent"),

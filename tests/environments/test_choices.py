@@ -3,6 +3,7 @@ tasks raise when a forbidden action is played, and no failure is tolerated."""
 
 import dataclasses
 import functools
+import re
 
 import equinox as eqx
 import gymnasium
@@ -267,6 +268,32 @@ def test_the_last_action_is_the_one_that_was_played(env):
     allowed = np.flatnonzero(np.asarray(first.obs[:N]))
     expected = np.where(np.arange(N) == allowed[0], 1.0, -1.0)
     np.testing.assert_array_equal(after[N + 1 : 2 * N + 1], expected)
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"choices": (2.0, 2)}, "choices is .* it must be a tuple of the options of each"),
+        ({"choices": (N, 3)}, "choices has 7 options and action_size is 4: it must hold them"),
+        ({"obs_size": N}, "masked is set, choices has 4 options and obs_size is 4"),
+        ({"scale": 0.5}, "what obs begins with at step 0 is no mask: give 1 or 0 for each option"),
+        ({"scale": 0.0}, "what obs begins with at step 0 is no mask"),
+    ],
+)
+def test_the_check_lists_what_is_wrong_with_choices(fields, told):
+    class Wrong(Forbidding):
+        scale = 1.0
+
+        def _answer(self, reward, *, key):
+            mask, now = super()._answer(reward, key=key)
+            scale = jnp.where(jnp.arange(N + 1) < N, self.scale, 1.0)
+            return mask, dataclasses.replace(now, obs=now.obs * scale)
+
+    for name, value in fields.items():
+        setattr(Wrong, name, value)
+    found = checks.check_environment(Wrong())
+    assert len(found) == 1
+    assert re.search(told, found[0])
 
 
 def test_the_check_follows_masks():

@@ -72,9 +72,26 @@ def _spec(env: AbstractEnvironment | AbstractHostEnvironment) -> list[str]:
         problems.append(f"signals is {names!r}: it must be a tuple of one or more names")
     elif len(set(names)) < len(names):
         problems.append(f"signals is {names!r}: a name occurs twice; give each reward its own")
+    problems += _choices(env)
     if isinstance(env, AbstractEnvironment) and not env.obs_range[0] < env.obs_range[1]:
         problems.append(f"obs_range is {env.obs_range}: it must be (least, largest)")
     return problems
+
+
+def _choices(env: AbstractEnvironment | AbstractHostEnvironment) -> list[str]:
+    """What a task says of the choices in its actions."""
+    counts = env.choices
+    if not isinstance(counts, tuple) or not all(isinstance(n, int) and n >= 1 for n in counts):
+        return [f"choices is {counts!r}: it must be a tuple of the options of each, at least 1"]
+    n = sum(counts)
+    if n > env.action_size:
+        return [f"choices has {n} options and action_size is {env.action_size}: it must hold them"]
+    if env.masked and not 0 < n < env.obs_size:
+        return [
+            f"masked is set, choices has {n} options and obs_size is {env.obs_size}: an "
+            "observation begins with one number for each option"
+        ]
+    return []
 
 
 def _reset_and_step(env: AbstractEnvironment) -> list[str]:
@@ -189,6 +206,8 @@ def _episodes(env: AbstractEnvironment) -> list[str]:
         "obs has NaN or inf at step {}: keep it finite for every action in [-1, 1]",
         f"obs leaves obs_range {env.obs_range} at step {{}}: widen obs_range, or clip",
         "a reward has NaN or inf at step {}: keep it finite for every action in [-1, 1]",
+        "what obs begins with at step {} is no mask: give 1 or 0 for each option, and a 1 to each "
+        "choice of every agent while the episode goes on",
     )
     problems = [
         "step: " + line.format(at)
@@ -249,11 +268,23 @@ def _look(env: AbstractEnvironment, time_step: TimeStep, step: Array) -> tuple[A
             ~jnp.all(jnp.isfinite(obs)),
             jnp.any((obs < low) | (obs > high)),
             ~jnp.all(jnp.isfinite(rewards)),
+            _no_mask(env, time_step),
         ]
     )
     content = jnp.nan_to_num(jnp.concatenate([obs, rewards]))
     weight = jnp.cos(step.astype(jnp.float32) + 1.0)
     return jnp.where(faults, step, _never(env)), content * weight
+
+
+def _no_mask(env: AbstractEnvironment, time_step: TimeStep) -> Array:
+    """Whether an observation should begin with what is allowed, and does not."""
+    if not env.masked:
+        return jnp.bool_(False)
+    mask = time_step.obs[..., : env.barrable]
+    parts = jnp.split(mask, np.cumsum(env.choices)[:-1].tolist(), axis=-1)
+    none = jnp.stack([jnp.any(jnp.max(part, axis=-1) < 0.5) for part in parts]).any()
+    ends = time_step.terminated | time_step.truncated
+    return jnp.any((mask != 0.0) & (mask != 1.0)) | (none & ~ends)
 
 
 def _never(env: AbstractEnvironment) -> int:
