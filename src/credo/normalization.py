@@ -46,6 +46,11 @@ class Moments(eqx.Module):
                 "part, which normalisation would change: give normalize_observations=False, or a "
                 "network with access='everyone' on a task without that number"
             )
+        if getattr(getattr(network, "network", network), "shape", None) is not None:
+            raise ValueError(
+                "normalize_observations changes every number of an image, which Convolutional "
+                "scales as a whole: give normalize_observations=False"
+            )
         obs_size, _, *team = env.sizes
         shape = (*team, obs_size)
         ones = jnp.ones(shape, jnp.float32)
@@ -94,7 +99,8 @@ def _with_rows(moments: Moments, obs: Array, active: Any, valid: Array) -> Momen
 def _summary(obs: Any, valid: Any, active: Any, xp: Any) -> tuple[Any, Any, Any]:
     """How many of the rows count, their mean and variance. The mean is corrected by the mean of
     what is left: a large offset would cost all digits of the variance."""
-    counts = valid if active is None else valid[:, None] & active
+    counts = valid.reshape(-1, *(1,) * (obs.ndim - 2))
+    counts = counts & (xp.ones(obs.shape[:-1], bool) if active is None else active)
     obs = xp.where(counts[..., None], obs, xp.zeros_like(obs))
     n = counts.sum(axis=0, dtype=np.int32)
     weight = (counts.astype(obs.dtype) / xp.maximum(n, 1).astype(obs.dtype)[None])[..., None]

@@ -197,7 +197,10 @@ class Replay(eqx.Module):
             at = (index + step) % self.capacity
             on = on & ~(rows.terminated | rows.truncated)
             on = on & jnp.broadcast_to(at != self.position, on.shape)
-            rows = rows.followed(self._rows(at), on, discount)
+            later = self._rows(at)
+            if later.active is not None:  # who has left is followed no further
+                on = on & later.active if on.ndim > 1 else on
+            rows = rows.followed(later, on, discount)
             discount = jnp.where(on, gamma * discount, discount)
         return rows, discount
 

@@ -123,7 +123,8 @@ class Units:
     `task` has `obs_size`, `action_size`, `agents` (None: no team); `action` or `actions`: None for
     [-1, 1], or a description of the action space, of a team one for each agent; and where they are
     known `observations` ({"n", "start"} of a Discrete), `names` of the agents, the options of its
-    `choices`, and whether it is `masked`: whether observations begin with which are allowed.
+    `choices`, whether it is `masked`: whether observations begin with which are allowed, and the
+    `lengths` of the agents' observations without that.
 
     **Raises:** `ValueError`, or what Python raises, if that makes no sense.
     """
@@ -138,6 +139,7 @@ class Units:
         self._mask = sum(task.get("choices") or ()) if task.get("masked") else 0
         if not 0 <= self._mask <= min(self.obs_size, self.action_size):
             raise ValueError(f"choices are {task['choices']}, more than an action or observation")
+        self._lengths = self._one_each("lengths", task.get("lengths"))
         self._discrete = task.get("observations") if agents is None else None
         if self._discrete is not None:
             n, start = self._discrete["n"], self._discrete["start"]
@@ -160,7 +162,9 @@ class Units:
                 f"the policy's output for {observation!r} is {output}: its weights, or numbers as "
                 "large as these, overflow"
             )
-        own = self.own(output, rows[..., : self._mask] > 0.5 if self._mask else mask)
+        if self._mask:  # of a task that takes numbers in [-1, 1] as they are, itself follows it
+            mask = None if self._own is None else rows[..., : self._mask] > 0.5
+        own = self.own(output, mask)
         if isinstance(observation, Mapping):
             return {name: own[k] for k, name in enumerate(self.names) if name in observation}
         if isinstance(own, list):
@@ -217,7 +221,8 @@ class Units:
 
     def _told(self, x: np.ndarray, mask: Any, k: int) -> np.ndarray:
         """An observation with what is allowed in front, which it may have already."""
-        if x.size <= self.obs_size - self._mask:
+        own = self.obs_size - self._mask if self._lengths is None else self._lengths[k]
+        if x.size == own:
             options = self._mask if self._own is None else self._own[k][0]
             x = np.append(np.arange(self._mask) < options, x).astype(np.float32)
         if mask is None:
@@ -442,7 +447,10 @@ class Output:
         self._activation, self._said = config["output_activation"], config.get("said", False)
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        y = ACTIVATIONS[self._activation](x)
+        if self._activation == "relative":  # of formats before 3
+            y = np.tanh(x - x.max())
+        else:
+            y = ACTIVATIONS[self._activation](x)
         return y, x if self._said else 2.0 * y - 1.0 if self._activation == "sigmoid" else y
 
 
@@ -953,11 +961,12 @@ class Choosing:
 
     def __call__(self, x: np.ndarray, memory: Any) -> tuple[np.ndarray, Any]:
         u, memory = self._inner(x, memory)
-        n = self._ends[-1]
-        if self._masked:
-            barred = np.where(x[..., :n] > 0.5, u[..., :n], np.float32(self.BARRED))
-            u = np.concatenate([barred, u[..., n:]], axis=-1)
         *parts, boxes = np.split(u, self._ends, axis=-1)
+        if self._masked:
+            masks = np.split(x[..., : self._ends[-1]] > 0.5, self._ends[:-1], axis=-1)
+            masks = [mask | ~mask.any(axis=-1, keepdims=True) for mask in masks]
+            barred = np.float32(self.BARRED)
+            parts = [np.where(*pair, barred) for pair in zip(masks, parts, strict=True)]
         below = [part - part.max(axis=-1, keepdims=True) for part in parts]
         return np.tanh(np.concatenate([*below, boxes], axis=-1)), memory
 

@@ -192,6 +192,7 @@ def test_a_task_says_how_it_takes_actions():
         "agents": None,
         "choices": [3],
         "masked": False,
+        "lengths": None,
         "actions": {"n": 3, "start": 5},
         "observations": None,
         "names": None,

@@ -33,8 +33,9 @@ from credo.networks.mlp import MLP
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team as TeamNetwork
 from credo.normalization import Moments
+from credo.runner import Units
 from credo.runs.policy import Policy
-from credo.types import TimeStep
+from credo.types import Batch, TimeStep
 
 KEY = jax.random.key(0)
 
@@ -215,6 +216,43 @@ def test_a_team_chooses_and_learns_each_for_itself(where, kind):
         given = {n: obs[n]["observation"] if where == "obs" else obs[n] for n in obs}
         obs, paid, *_ = team.step(policy(given, masks))
         assert set(paid.values()) <= {0.0, 1.0}
+
+
+def test_where_nothing_is_allowed_all_counts_as_such():
+    """As at the end of an episode: a value of -1e9 would enter targets."""
+    network = Choosing(MLP((4,)), (2, 2), masked=True)
+    policy = network.init(6, 4, key=KEY)
+    obs = jnp.array([0.0, 0, 0, 1, 0.2, 0.3])
+    u = policy.spoken(obs, ())[1]
+    assert (np.asarray(u) == -1e9).tolist() == [False, False, True, False]
+    learners = (DQN(gamma=0.9), DQN(gamma=0.9, dueling=True), DiscreteSAC(gamma=0.9))
+    single = Choosing(MLP((4,)), (4,), masked=True)
+    rows = [jnp.zeros((3, 6)), jnp.ones((3, 4)), jnp.ones(3), jnp.zeros((3, 6))]
+    batch = Batch(*rows, jnp.zeros(3, bool), jnp.ones(3, bool))
+    for learner in learners:
+        state = learner.init(single, 6, 4, key=KEY)
+        _, metrics = learner.update(state, batch, key=KEY)
+        assert all(abs(float(x)) < 100 for x in metrics.values())
+
+
+def test_a_mask_may_stand_before_the_observation_of_any_agent():
+    """That of the second, with its mask, is as short as that of the first without."""
+    env = task("Team", PettingZoo)
+    assert env.task_record()["lengths"] == [2, 1]
+    units = Units(env.task_record() | {"names": None})
+    given = [[0, 1, 1, 0.5, 0.6], [0, 1, 0, 0.5]]
+    read = units.read(given)
+    np.testing.assert_allclose(read, [[0, 1, 1, 0.5, 0.6], [0, 1, 0, 0.5, 0]])
+    np.testing.assert_allclose(
+        units.read([[0.5, 0.6], [0.5]]), [[1, 1, 1, 0.5, 0.6], [1, 1, 0, 0.5, 0]]
+    )
+
+
+def test_what_says_discrete_itself_is_refused():
+    with pytest.raises(TypeError, match=r"Old sets discrete, which follows from choices: give"):
+
+        class Old(Forbidding):
+            discrete = True
 
 
 def test_a_team_that_is_masked_learns_by_ppo():

@@ -15,11 +15,15 @@ from credo.algorithms.ppo import PPO
 from credo.environments.base import AbstractEnvironment
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.hidden import hidden
+from credo.environments.last_step import with_last_step
+from credo.environments.wrappers import NoisyObservations, delayed
 from credo.learners.dqn import DQN
+from credo.networks.choosing import choosing
 from credo.networks.convolutional import Convolutional
 from credo.networks.mlp import MLP
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team
+from credo.normalization import Moments
 from credo.runner import VERSION, Runner
 from credo.runs.export import parts_of
 from credo.types import TimeStep
@@ -99,6 +103,16 @@ def test_a_task_says_where_its_image_is():
     for env in (Gymnasium("CartPole-v1", in_process=True), hidden(pictures, (0,))):
         with pytest.raises(ValueError, match="shows no image, a Box of height, width and channels"):
             Convolutional().fitted(env)
+
+
+def test_wrappers_change_nothing_of_an_image():
+    for env in (with_last_step(Look()), NoisyObservations(Look(), 1.0), delayed(Look())):
+        assert Convolutional().fitted(env) == Convolutional().fitted(Look())
+    with pytest.raises(ValueError, match="normalize_observations changes every number of an image"):
+        Moments.first(Look(), choosing(Look(), Convolutional().fitted(Look())))
+    team = Team(trunk=(), head=Convolutional(MLP((4,)), (6, 6, 1)))
+    assert not team.remembers
+    assert team.init(36, 2, 3, key=KEY).agents == 3
 
 
 WRONG = {

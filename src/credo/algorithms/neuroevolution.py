@@ -35,6 +35,7 @@ from ..evolution.mutation import MatrixMutation
 from ..evolution.selection import rankable, ranking
 from ..evolution.strategies import Strategy
 from ..networks.base import AbstractNetwork
+from ..networks.choosing import Choosing
 from ..networks.mmu import MMU
 from ..normalization import Moments, frozen, play
 from ..rollout import Environment, score
@@ -141,6 +142,9 @@ class Neuroevolution(eqx.Module):
             }
         if isinstance(network, MMU):
             network = replace(network, start_weights="saturated")
+        elif isinstance(network, Choosing) and isinstance(network.network, MMU):
+            inner = replace(network.network, start_weights="saturated")
+            network = replace(network, network=inner)
         return cls.as_coded(env, network, **overridden(settings, overrides))
 
     @classmethod

@@ -136,7 +136,8 @@ class Watch(PolicyOf):
 @dataclasses.dataclass
 class Export(PolicyOf):
     """A run's policy in one file that acts without JAX (`credo.Runner.load(FILE)`); the file is
-    policy.safetensors of the run's folder if none is named."""
+    policy.safetensors of the run's folder if none is named. One that ends in .onnx is a graph for
+    ONNX Runtime (the extra onnx)."""
 
     file: str | None = None
 
@@ -147,6 +148,12 @@ class Export(PolicyOf):
 
         run = self.only("export")
         target = self.file or run.path / "policy.safetensors"
+        if str(target).endswith(".onnx"):
+            from ..runs import onnx
+
+            print(f"policy: {onnx.export(run, target)}")
+            print(f'use it: onnxruntime.InferenceSession("{target}"), which says its inputs')
+            return
         print(f"policy: {export.export(run, target)}")
         print(f'use it: policy = credo.Runner.load("{target}"); action = policy(observation)')
 

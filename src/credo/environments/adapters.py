@@ -49,6 +49,7 @@ class Single:
 
     agents: ClassVar[int | None] = None
     groups: ClassVar[None] = None
+    lengths: ClassVar[None] = None
     names: ClassVar[None] = None
     signals: ClassVar[list[tuple[str, bool]]] = [("reward", False)]  # name, private to an agent
 
@@ -224,6 +225,7 @@ class Team:
         self._learn_actions(env)
         spaces = [env.observation_space(name) for name in self.names]
         kinds = [(str(space), str(told)) for space, told in zip(spaces, self.actions, strict=True)]
+        self.lengths = [_flat(_without_mask(s) if _shown_mask(s) else s).size for s in spaces]
         self.groups = [list(dict.fromkeys(kinds)).index(kind) for kind in kinds]
         self._seen = [_shown_mask(space) is not None for space in spaces]
         self.masked = self._uneven or any(self._seen) or (bool(self.choices) and _masks(env))

@@ -50,6 +50,14 @@ class AbstractTask(eqx.Module):
         kind of things. By default all are alike."""
         return None if self.agents is None else (0,) * self.agents
 
+    def __init_subclass__(cls, **kwargs):
+        super().__init_subclass__(**kwargs)
+        if isinstance(cls.__dict__.get("discrete"), bool):
+            raise TypeError(
+                f"{cls.__name__} sets discrete, which follows from choices: give choices = (3,) to "
+                "a task whose action is one of three"
+            )
+
     @property
     def reported(self) -> str:
         """The reward signal by which a champion is judged."""

@@ -446,6 +446,7 @@ RECORDED = (
     "agents",
     "choices",
     "masked",
+    "lengths",
     "actions",
     "observations",
     "names",

@@ -35,7 +35,8 @@ def chosen(xp: Any, action: Any, env: AbstractTask, allowed: Any) -> Any:
     for n in env.choices:
         part = action[..., start : start + n]
         largest = xp.argmax(part, axis=-1)[..., None]
-        told.append(xp.where(xp.arange(n) == largest, xp.float32(1.0), xp.float32(-1.0)))
+        options = xp.broadcast_to(xp.arange(n), part.shape)
+        told.append(xp.where(options == largest, xp.float32(1.0), xp.float32(-1.0)))
         start += n
     return xp.concatenate([*told, xp.clip(action[..., start:], -1.0, 1.0)], axis=-1)
 

@@ -37,6 +37,7 @@ SIZES = (
     "choices",
     "image",
     "groups",
+    "lengths",
     "masked",
     "agents",
     "signals",

@@ -56,7 +56,7 @@ class DiscreteSACState(eqx.Module):
 class DiscreteSAC(AbstractLearner):
     """Soft actor-critic of discrete actions. Its actor takes the likeliest one."""
 
-    metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "actor_loss", "alpha")
+    metrics: ClassVar[tuple[str, ...]] = ("critic_loss", "q", "actor_loss", "alpha")
     teams: ClassVar[bool] = True
     discrete: ClassVar[bool] = True
 
@@ -99,7 +99,7 @@ class DiscreteSAC(AbstractLearner):
         alpha = jnp.exp(state.log_alpha)
         given = (state.critics, batch, self.soft_target(state, batch, alpha))
         rate = (state.critic_opt, self.critic_lr)
-        critics, critic_opt, (critic_loss, _) = descend(critic_error, given, *rate)
+        critics, critic_opt, (critic_loss, q) = descend(critic_error, given, *rate)
         given = (state.actor, lesser(critics, batch), batch, alpha)
         rate = (state.actor_opt, self.actor_lr)
         actor, actor_opt, (loss, told) = descend(actor_loss, given, *rate)
@@ -109,7 +109,7 @@ class DiscreteSAC(AbstractLearner):
         log_alpha, alpha_opt = adam(state.log_alpha, short, state.alpha_opt, self.alpha_lr)
         targets = polyak(state.targets, critics, self.tau)
         opts = (actor_opt, critic_opt, alpha_opt)
-        metrics: Metrics = {"critic_loss": critic_loss, "actor_loss": loss, "alpha": alpha}
+        metrics: Metrics = {"critic_loss": critic_loss, "q": q, "actor_loss": loss, "alpha": alpha}
         return DiscreteSACState(actor, critics, targets, log_alpha, *opts), metrics
 
     def soft_target(self, state: DiscreteSACState, batch: Batch, alpha: Array) -> Returns:
@@ -144,10 +144,11 @@ def expected(log_p: Options, x: Options) -> Value:
 
 
 def critic_error(critics: tuple[AbstractPolicy, ...], batch: Batch, target: Returns):
-    """Half the sum over critics of the mean squared error of what was done, equation 9."""
-    values = [spoken(one, batch, stored=False)[1] for one in critics]
-    errors = [jnp.square(valued(q, batch.action) - target[0]) for q in values]
-    return 0.5 * sum(mean(error, batch.active) for error in errors), None
+    """Half the sum over critics of the mean squared error of what was done, equation 9, and the
+    mean value of that."""
+    values = [valued(spoken(one, batch, stored=False)[1], batch.action) for one in critics]
+    errors = [mean(jnp.square(q - target[0]), batch.active) for q in values]
+    return 0.5 * jnp.sum(jnp.stack(errors)), mean(jnp.mean(jnp.stack(values), axis=0), batch.active)
 
 
 def actor_loss(actor: AbstractPolicy, q: Options, batch: Batch, alpha: Array):
@@ -156,5 +157,5 @@ def actor_loss(actor: AbstractPolicy, q: Options, batch: Batch, alpha: Array):
     u = spoken(actor, batch)[1]
     log_p = jax.nn.log_softmax(u, axis=0)
     loss = mean(expected(log_p, alpha * log_p - q), batch.active)
-    most = jnp.log(jnp.maximum(jnp.sum((u != BARRED).astype(jnp.float32), axis=0), 1.0))
+    most = jnp.log(jnp.sum((u != BARRED).astype(jnp.float32), axis=0))
     return loss, (expected(log_p, -log_p), most)

@@ -59,9 +59,7 @@ class ActionValues(eqx.Module):
         if self.head is None:
             return q
         allowed = q != BARRED
-        average = jnp.mean(
-            q, axis=0, keepdims=True, where=allowed | ~jnp.any(allowed, axis=0)[None]
-        )
+        average = jnp.mean(q, axis=0, keepdims=True, where=allowed)
         return jnp.where(allowed, linear(self.head, 0, features) + q - average, BARRED)
 
 

@@ -55,17 +55,19 @@ class Choosing(AbstractNetwork):
     def parts(self, u: Array) -> list[Array]:
         """Of an action its numbers by choice, and those of its Boxes."""
         cuts = list(itertools.accumulate(self.choices))
-        return [part for part in jnp.split(u, cuts, axis=self.axis) if part.shape[self.axis]]
+        boxes = u.shape[self.axis] > cuts[-1]
+        return jnp.split(u, cuts if boxes else cuts[:-1], axis=self.axis)
 
     def allowed(self, u: Array, obs: Array, barred: float = BARRED) -> Array:
         """Outputs, or an action, with `barred` where an option is not allowed."""
         if not self.masked:
             return u
-        n = sum(self.choices)
-        boxes = [(0, 0)] * u.ndim
-        boxes[self.axis] = (0, u.shape[self.axis] - n)
-        mask = jax.lax.slice_in_dim(obs, 0, n, axis=self.axis % obs.ndim) > 0.5
-        return jnp.where(jnp.pad(mask, boxes, constant_values=True), u, barred)
+        n, axis = sum(self.choices), self.axis % u.ndim
+        mask = jax.lax.slice_in_dim(obs, 0, n, axis=axis) > 0.5
+        # Where nothing is allowed, as tasks may say at an episode's end, there is nothing to tell.
+        parts = [part | ~jnp.any(part, axis, keepdims=True) for part in self.parts(mask)]
+        boxes = jnp.ones_like(jax.lax.slice_in_dim(u, n, u.shape[axis], axis=axis), bool)
+        return jnp.where(jnp.concatenate([*parts, boxes], axis=axis), u, barred)
 
     def action(self, u: Array) -> Array:
         """Outputs as an action in [-1, 1]."""

@@ -76,7 +76,8 @@ class Convolutional(AbstractNetwork):
                 "and channels: give shape and start of one, or another network"
             )
         start, *shape = env.image
-        high = np.broadcast_to(np.asarray(env.obs_range[1]), env.obs_size)[start]
+        task = env.unwrapped  # wrappers add numbers without bounds, none of which is in the image
+        high = np.broadcast_to(np.asarray(task.obs_range[1]), task.obs_size)[task.image[0]]
         return replace(
             self, shape=tuple(shape), start=start, scale=255.0 if high == 255 else self.scale
         )

@@ -78,9 +78,14 @@ class Team(AbstractNetwork):
             agents,
         )
 
+    @property
+    def least(self) -> int:
+        return 2 if self.trunk else self.head.least
+
     def fitted(self, env: Any) -> Self:
         groups = env.groups if self.sharing == "groups" and not self.groups else self.groups
-        return replace(self, groups=tuple(groups))
+        head = self.head if self.trunk else self.head.fitted(env)
+        return replace(self, groups=tuple(groups or ()), head=head)
 
     def _numbers(self, agents: int) -> tuple[int, int]:
         """Of trunks and of heads. Raises `ValueError` unless every agent has a group."""
@@ -214,6 +219,10 @@ class Centralized(AbstractNetwork):
     team: ClassVar[bool] = True
 
     network: AbstractNetwork = MLP(hidden=(300,))  # the network that acts for all agents
+
+    @property
+    def least(self) -> int:
+        return self.network.least
 
     def init(
         self, obs_size: int, action_size: int, agents: int = 1, *, key: PRNGKeyArray

@@ -31,14 +31,19 @@ def export(run: Run, path: str | pathlib.Path) -> pathlib.Path:
     path = pathlib.Path(path)
     if not path.parent.is_dir():
         raise RunError(f"{path.parent} is no folder: make it first, or name another file")
-    policy = champion(run)
-    network, weights = parts_of(policy)
-    description = json.dumps(_describe(run, network))
+    told, weights = described(run)
+    description = json.dumps(told)
     metadata = {DESCRIPTION: description, FINGERPRINT: fingerprint(description, weights)}
     with files.whole(path) as draft:
         draft.write_bytes(safetensors.numpy.save(weights, metadata))
         Runner.load(draft)  # what cannot be read should fail now, not where it is to act
     return path
+
+
+def described(run: Run) -> tuple[dict[str, Any], Weights]:
+    """What a file says of a run's champion, and its weights."""
+    network, weights = parts_of(champion(run))
+    return _describe(run, network), weights
 
 
 def parts_of(policy: Any) -> tuple[dict[str, Any], Weights]:
@@ -116,4 +121,5 @@ def _describe(run: Run, network: dict[str, Any]) -> dict[str, Any]:
         "names": task.get("names"),
         "choices": task.get("choices") or (),
         "masked": task.get("masked", False),
+        "lengths": task.get("lengths"),
     }

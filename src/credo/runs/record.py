@@ -134,7 +134,12 @@ def task_of(env: Any) -> dict[str, Any]:
         folder = os.fsencode(os.getcwd()).decode(errors="replace")
     except OSError:  # it was removed
         folder = None
-    return _sizes(env) | {"actions": None, "observations": None} | (told or {}) | {"folder": folder}
+    choices = {
+        "choices": list(getattr(env, "choices", ())),
+        "masked": getattr(env, "masked", False),
+    }
+    unknown = {"actions": None, "observations": None} | choices
+    return _sizes(env) | unknown | (told or {}) | {"folder": folder}
 
 
 def check_task(record: Mapping[str, Any], env: Any) -> None:
