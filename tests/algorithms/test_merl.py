@@ -18,7 +18,6 @@ from credo.algorithms.lineage import DRAWN, INJECTED
 from credo.algorithms.merl import BREEDER, LOCAL, MERL
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.algorithms.off_policy import OffPolicy
-from credo.algorithms.ppo import PPO
 from credo.compilation import jit
 from credo.environments.extended_tmaze import ExtendedTMaze
 from credo.environments.probes import Copy, Meet
@@ -449,7 +448,6 @@ def test_learners_alone_learn_to_meet(name):
         ),
         (lambda: OffPolicy(Meet(), MLP()), r"put it on a team, as in Team\(head=MLP\(\.\.\.\)\)"),
         (lambda: Neuroevolution(Meet(), MLP()), r"Meet has 2.*Team\(head=MLP"),
-        (lambda: PPO(Meet(), Team()), "Meet has 2 agents: PPO cannot learn that.*TD3"),
         (lambda: OffPolicy.sac(Meet(), Team()), "Meet has 2 agents: SAC cannot learn that.*TD3"),
         (
             lambda: dataclasses.replace(ALGORITHM, learners=(LEARNER, SAC())),

@@ -9,7 +9,7 @@ from credo.algorithms.ppo import PPO
 from credo.cli.names import ALGORITHMS, load
 from credo.environments import wrappers
 from credo.environments.gymnasium import Gymnasium
-from credo.environments.probes import Copy, Meet, Remember
+from credo.environments.probes import Choose, Copy, Meet, Remember
 from credo.networks.mmu import MMU
 from credo.runs.config import to_tree
 from credo.runs.folder import free_name
@@ -28,6 +28,10 @@ def test_a_preset_does_not_change_the_word():
     assert algorithm_word(to_tree(ERL.ours(Copy()))) == "erl"
     assert algorithm_word(to_tree(ERL.hybrid(Copy(), learners=()))) == "ea"
     assert algorithm_word(to_tree(Neuroevolution.ours(Remember(), MMU()))) == "neuroevolution"
+
+
+def test_sac_is_one_word_whatever_the_actions():
+    assert algorithm_word(to_tree(OffPolicy.sac(Choose()))) == "sac"
 
 
 def test_tasks_are_called_by_their_id_or_class():

@@ -21,6 +21,8 @@ def algorithm_word(algorithm: Mapping[str, Any]) -> str:
     name = _class(algorithm)
     if name == "ERL":
         return _hybrid_word(algorithm, len(algorithm.get("learners", ())))
+    if name == "Neuroevolution" and _class(algorithm.get("breeder") or {"class": ""}) == "Strategy":
+        return "es"
     return _learner_word(algorithm["learner"]) if name == "OffPolicy" else name.lower()
 
 
@@ -46,7 +48,7 @@ def task_word(env: Mapping[str, Any]) -> str:
 def _learner_word(learner: Mapping[str, Any]) -> str:
     name = _class(learner)
     if name != "TD3":
-        return name.lower()
+        return name.lower().removeprefix("discrete")  # SAC is one word
     team = "ma" if _class(learner["critic"]) == "JointCritic" else ""
     return team + ("td3" if learner["critics"] > 1 else "ddpg")
 
