@@ -105,4 +105,4 @@ def test_a_task_that_brax_itself_cannot_play_is_refused():
 def test_nothing_is_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        Brax("reacher", backend="spring")
+        assert Brax("reacher", backend="spring").action_size == 2

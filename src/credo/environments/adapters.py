@@ -125,13 +125,7 @@ class Single:
     def _allow(self, obs: Any, info: Any, frame: Any, i: int, over: bool = False) -> None:
         """Remember what copy `i` allows next, as far as it says, and tell it. Behind the end of an
         episode it need not say anything."""
-        says = obs if self._seen else info
-        told = says.get("action_mask") if isinstance(says, dict) else None
-        if told is not None and not self.masked:
-            raise Fault(
-                "returned an action_mask in step and none in reset",
-                "give it in both, so that learners know that there is one",
-            )
+        told = _told(obs if self._seen else info, self.masked)
         mask = None if told is None or over else _mask(told, self.choices)
         self._masks.pop(i, None)
         if mask is not None:
@@ -146,6 +140,18 @@ class Single:
             for i, mask in self._masks.items():
                 actions[i, : self._options][~mask] = -np.inf
         return self._choose(actions)
+
+
+def _told(says: Any, masked: bool) -> Any:
+    """The `action_mask` in an observation or an info; None: it has none. Raises `Fault` of one that
+    was not there in the first reset."""
+    told = says.get("action_mask") if isinstance(says, Mapping) else None
+    if told is not None and not masked:
+        raise Fault(
+            "returned an action_mask in step and none in reset",
+            "give it in both, so that learners know that there is one",
+        )
+    return told
 
 
 def _mask(told: Any, choices: Sequence[int]) -> np.ndarray:
@@ -360,13 +366,7 @@ class Team:
         """What the agents of copy `i` may do next."""
         for name, k in self._rows.items():
             self._masks.pop((i, k), None)
-            says = obs.get(name) if self._seen[k] else infos.get(name)
-            told = says.get("action_mask") if isinstance(says, Mapping) else None
-            if told is not None and not self.masked:
-                raise Fault(
-                    "returned an action_mask in step and none in reset",
-                    "give it in both, so that learners know that there is one",
-                )
+            told = _told(obs.get(name) if self._seen[k] else infos.get(name), self.masked)
             if told is not None and name in here:
                 self._masks[i, k] = _mask(told, self._acts[k].choices)
 
