@@ -28,14 +28,14 @@ test: $(VENV)/installed
 
 test-all: test $(WORLDS)/installed $(GYMNAX)/installed
 	$(BIN)/python -m pytest --numprocesses $(WORKERS) -m slow
-	$(WORLDS)/bin/python -m pytest --numprocesses $(WORKERS) $(addprefix tests/environments/test_,brax.py jaxmarl.py jumanji.py) tests/evolution/test_strategies.py tests/runs/test_onnx.py
+	$(WORLDS)/bin/python -m pytest --numprocesses $(WORKERS) $(addprefix tests/environments/test_,brax.py jaxmarl.py jumanji.py playground.py) tests/evolution/test_strategies.py tests/runs/test_onnx.py
 	$(GYMNAX)/bin/python -m pytest --numprocesses $(WORKERS) tests/environments/test_gymnax.py
 
 # Packages of tasks, and strategies, of others: in environments of their own, since they bring much with them. gymnax wants a
 # Gymnasium that is older than ours.
 $(WORLDS)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(WORLDS)
-	$(WORLDS)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[brax,jaxmarl,jumanji,onnx,strategies]' pytest pytest-xdist
+	$(WORLDS)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[brax,jaxmarl,jumanji,onnx,playground,strategies]' pytest pytest-xdist
 	@touch $@
 
 $(GYMNAX)/installed: pyproject.toml constraints.txt

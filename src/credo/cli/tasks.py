@@ -29,6 +29,7 @@ IN_JAX = {  # packages of tasks in JAX, which name theirs package:id
         ("gymnax", "Gymnax"),
         ("jaxmarl", "JaxMARL"),
         ("jumanji", "Jumanji"),
+        ("playground", "Playground"),
     )
 }
 
