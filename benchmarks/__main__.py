@@ -16,6 +16,7 @@ NAMES = (
     "ppo_jax",
     "dqn",
     "erl_hopper",
+    "erl_brax",
     "rover_step",
     "maddpg_update",
     "first_output",

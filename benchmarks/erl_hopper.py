@@ -23,6 +23,7 @@ from dataclasses import replace
 import jax
 
 from credo.algorithms.erl import BREEDER, ERL
+from credo.environments.base import AbstractEnvironment
 from credo.environments.gymnasium import Gymnasium
 from credo.learners.td3 import TD3
 from credo.networks.mlp import MLP
@@ -45,11 +46,14 @@ def cpu_seconds() -> float:
     return time.process_time() + ticks / os.sysconf("SC_CLK_TCK")
 
 
-def measure(seconds: float) -> dict[str, float]:
-    """Credo's generations for so many CPU seconds, after two that learned."""
+def measure(seconds: float, env: AbstractEnvironment | None = None) -> dict[str, float]:
+    """Credo's generations for so many CPU seconds, after two that learned.
+
+    **Arguments:** `env`: None: MuJoCo's Hopper.
+    """
     network = MLP(hidden=(256, 256), activation="relu", initializer="uniform")
     erl = ERL(
-        Gymnasium("Hopper-v5"),
+        env or Gymnasium("Hopper-v5"),
         network,
         learners=(TD3(),),
         breeder=replace(BREEDER, elite_fraction=0.2),

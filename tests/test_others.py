@@ -1,5 +1,6 @@
-"""The examples in which others train on tasks of ours: each runs, where its package is there."""
+"""Examples: others train on tasks of ours, where their package is there; a policy for a hub."""
 
+import hashlib
 import importlib.util
 import pathlib
 import re
@@ -7,6 +8,8 @@ import subprocess
 import sys
 
 import pytest
+
+from credo.runner import Runner
 
 EXAMPLES = pathlib.Path(__file__).parents[1] / "examples"
 PACKAGES = {
@@ -34,3 +37,21 @@ def test_it_is_short_and_named_in_the_docs(name):
     assert len(lines) <= 80
     page = EXAMPLES.parent / "docs" / "how-to" / "others.md"
     assert f"others_{name}.py" in page.read_text("utf-8")
+
+
+@pytest.mark.slow
+def test_a_policy_is_prepared_for_a_hub_with_its_card(tmp_path):
+    """The folder that would be sent: a policy that can be played, and what it scored."""
+    run, folder = tmp_path / "run", tmp_path / "folder"
+    train = ["-m", "credo", "train", "neuroevolution", "sequence-classification"]
+    publish = [str(EXAMPLES / "publish_policy.py"), str(run), str(folder), "--license", "mit"]
+    for words in ([*train, "--generations", "2", "--path", str(run)], publish):
+        done = subprocess.run([sys.executable, *words], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    policy = folder / "policy.safetensors"
+    assert Runner.load(policy).description["task"] == "SequenceClassification"
+    card = (folder / "README.md").read_text("utf-8")
+    assert "license: mit" in card
+    assert re.search(r"run: \d+ fresh episodes.*accuracy +0?\.?\d", card, re.DOTALL)
+    assert hashlib.sha256(policy.read_bytes()).hexdigest() in card
+    assert str(tmp_path) not in card  # no path of this machine is published
