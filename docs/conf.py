@@ -34,6 +34,7 @@ html_copy_source = False
 html_show_copyright = False
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_js_files = ["claims.js"]
 if home:
     html_theme_options = {
         "source_repository": home,

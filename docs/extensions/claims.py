@@ -1,0 +1,295 @@
+"""The page of claims: what the dissertation says, what is committed here, and a verdict by rule.
+
+python docs/extensions/claims.py      # writes docs/results/claims.md anew, after results were added
+
+Claims are in `docs/results/claims.toml`, whose head says what a part may hold. A verdict is never
+written by hand: it follows from the committed rows by the rule that the page states.
+"""
+
+import itertools
+import json
+import pathlib
+import sys
+import tomllib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from credo.analysis.statistics import (
+    bootstrap_interval,
+    improvement_interval,
+    probability_of_improvement,
+)
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+RESULTS, PAGE = ROOT / "results", ROOT / "docs" / "results" / "claims.md"
+SOURCE = PAGE.with_suffix(".toml")
+BEGIN, END = "<!-- claims: python docs/extensions/claims.py -->\n", "<!-- end of claims -->\n"
+BUDGETS = ("published", "million", "full", "quick")  # the largest first
+FEWEST = 3  # seeds of a cell that decides
+NEVER = 1e30  # in place of None, where a run did not get there
+VERDICTS = ("reproduced", "in part", "not reproduced", "refuted", "open")
+REDUCE = {"mean": np.mean, "max": np.max, "min": np.min, "count": len}
+PLAIN = ("episode",)  # columns that number repetitions within a run
+
+
+class Found(NamedTuple):
+    """What one part of a claim comes to."""
+
+    verdict: str
+    text: str
+    seeds: int = 0
+    path: pathlib.Path | None = None
+
+
+def claims() -> list[dict[str, Any]]:
+    return tomllib.loads(SOURCE.read_text("utf-8"))["claims"]
+
+
+def parts(claim: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """The parts of a claim, those with `over` once for each of its combinations."""
+    for part in claim["parts"]:
+        over = part.get("over", {})
+        for values in itertools.product(*over.values()):
+            new = dict(zip(over, values, strict=True))
+            told = part.get("of", ", ".join(str(x) for x in values))
+            yield part | {"cell": part.get("cell", {}) | new, "of": told, "new": new}
+
+
+def record(experiment: str, cells: list[dict[str, Any]]) -> tuple[pathlib.Path, dict] | None:
+    """The largest committed budget of an experiment that has all these cells."""
+    for budget in BUDGETS:
+        path = RESULTS / experiment / budget / "results.json"
+        if path.exists():
+            found = json.loads(path.read_text("utf-8"))
+            if all(labels_of(found, cell) is not None for cell in cells):
+                return path, found
+    return None
+
+
+def labels_of(found: Mapping[str, Any], cell: Mapping[str, Any]) -> dict[str, Any] | None:
+    """All labels of the cell of which a claim names those that tell it apart, and of rows of it;
+    of several cells that with the fewest labels. None: there is none."""
+    cells = sorted((x["labels"] for x in found["cells"]), key=len)
+    known = set().union(*cells)
+    wanted = {name: None if value == "none" else value for name, value in cell.items()}
+    for labels in cells:
+        if all(labels.get(name) == value for name, value in wanted.items() if name in known):
+            return {name: x for name, x in (labels | wanted).items() if x is not None}
+    return None
+
+
+def values(
+    found: Mapping[str, Any], part: Mapping[str, Any], cell: Mapping[str, Any]
+) -> np.ndarray:
+    """A number of each seed: the mean of its rows of one metric, or its curve at one place."""
+    wanted, columns = labels_of(found, cell), found["columns"]
+    if "at" in part:
+        curves = [
+            x for x in found["curves"] if x["labels"] == wanted and x["metric"] == part["metric"]
+        ]
+        if not curves or part["at"] not in curves[0]["at"]:
+            raise ValueError(f"{part}: no such curve of {wanted}, or no such place")
+        curve = curves[0]
+        seeds = np.array([[_number(x) for x in values] for values in curve["seeds"].values()])
+        picked = seeds[:, curve["at"].index(part["at"])]
+        if "minus" in part:  # of the same run
+            picked = picked - seeds[:, curve["at"].index(part["minus"])]
+        return picked
+    pooled = (*PLAIN, *part.get("pool", ()))
+    runs: dict[Any, list[float]] = {}
+    for row in found["rows"]:
+        told = dict(zip(columns, row, strict=True))
+        seed, metric, value = (told.pop(name) for name in ("seed", "metric", "value"))
+        told = {name: x for name, x in told.items() if x is not None and name not in pooled}
+        if metric == part["metric"] and told == wanted:
+            runs.setdefault(seed, []).append(_number(value))
+    return np.array([REDUCE[part.get("reduce", "mean")](x) for x in runs.values()])
+
+
+def _number(x: Any) -> float:
+    return NEVER if x is None else float(x)
+
+
+def found(part: Mapping[str, Any]) -> Found:
+    """The verdict on one part."""
+    cell = part["cell"]
+    named = part.get("above", part.get("relative"))
+    other = None if named is None else cell | named
+    elsewhere = part.get("than", part["experiment"]) != part["experiment"]
+    committed = record(part["experiment"], [cell] + ([other] if other and not elsewhere else []))
+    second = record(part["than"], [other]) if other and elsewhere else committed
+    if committed is None or second is None:
+        return Found("open", f"{part['of']}: no data".removeprefix(": "))
+    path, data = committed
+    mine = values(data, part, cell)
+    if not mine.size:
+        raise ValueError(f"{part}: no row of {path} fits")
+    theirs = None if other is None else values(second[1], part, other)
+    if theirs is None or "relative" in part:
+        verdict, text, seeds = level(mine if theirs is None else mine / theirs.mean(), part)
+    else:
+        verdict, text, seeds = comparison(mine, theirs, part.get("less", False), scale(part))
+    few = seeds < FEWEST and not part.get("single", False)
+    if few or (part.get("short", False) and verdict != "reproduced"):
+        verdict = "open"
+    return Found(verdict, f"{part['of']}: {text}".removeprefix(": "), seeds, path)
+
+
+def scale(part: Mapping[str, Any]) -> float:
+    return 100.0 if part.get("unit") == "%" else 1.0
+
+
+def level(x: np.ndarray, part: Mapping[str, Any]) -> tuple[str, str, int]:
+    """A number against one that it must reach, or must not pass."""
+    factor, n = scale(part), len(x)
+    if part.get("best", False):
+        x = x[[np.argmax(x)]]
+    mean = float(np.mean(x))
+    low, high = (float(y) for y in bootstrap_interval(x)) if len(x) > 1 else (mean, mean)
+    if np.isnan(low):  # of values that are all alike there is no other
+        low = high = mean
+    if part.get("positive", False):
+        verdict = (
+            "reproduced"
+            if low > 0.0
+            else "refuted"
+            if high < 0.0
+            else "in part"
+            if mean > 0.0
+            else "not reproduced"
+        )
+        return verdict, _shown(mean, low, high, factor), n
+    if "at_least" in part:
+        goal, error = part["at_least"], part.get("error", 0.0)
+        reached, possible, otherwise = mean >= goal, high >= goal - error, "not reproduced"
+    else:
+        goal = part["at_most"]
+        reached, possible, otherwise = mean <= goal, low <= goal, "refuted"
+    verdict = "reproduced" if reached else "in part" if possible else otherwise
+    return verdict, _shown(mean, low, high, factor), n
+
+
+def comparison(x: np.ndarray, y: np.ndarray, less: bool, factor: float) -> tuple[str, str, int]:
+    """Whether a run of the first is above one of the second; with `less`, below."""
+    sign = -1.0 if less else 1.0
+    better = probability_of_improvement(sign * x, sign * y)
+    low, high = improvement_interval(sign * x, sign * y)
+    means = " against ".join(_one(float(np.mean(z)), factor) for z in (x, y))
+    text = f"{means}; P {better:.2f} ({low:.2f} to {high:.2f})"
+    if low > 0.5:
+        verdict = "reproduced"
+    elif high < 0.5:
+        verdict = "refuted"
+    else:
+        verdict = "in part" if better > 0.5 else "not reproduced"
+    return verdict, text, min(len(x), len(y))
+
+
+def _one(x: float, factor: float) -> str:
+    return (
+        "never"
+        if abs(x) > NEVER / 100
+        else f"{x * factor:.3g}"
+        if abs(x * factor) < 1e3
+        else f"{x * factor:,.0f}"
+    )
+
+
+def _shown(mean: float, low: float, high: float, factor: float) -> str:
+    if low == high:
+        return _one(mean, factor)
+    return f"{_one(mean, factor)} ({_one(low, factor)} to {_one(high, factor)})"
+
+
+def together(verdicts: list[str]) -> str:
+    """The verdict on a claim from those on its parts."""
+    kinds = set(verdicts)
+    if len(kinds) == 1:
+        return verdicts[0]
+    if "open" in kinds:
+        return "open"
+    if "reproduced" in kinds or "in part" in kinds:
+        return "in part"
+    return "refuted" if "refuted" in kinds else "not reproduced"
+
+
+def row(number: int, claim: Mapping[str, Any]) -> tuple[str, str]:
+    """A line of the table, and its verdict."""
+    every = [found(part) for part in parts(claim)]
+    there = [x for x in every if x.path]
+    verdict = together([x.verdict for x in every])
+    ours = "; ".join(x.text for x in there) or "no data"
+    if there and claim["parts"][0].get("unit") == "%":
+        ours += " %"
+    if there and len(there) < len(every):
+        ours += f"; {len(every) - len(there)} of {len(every)} without data"
+    seeds = sorted({x.seeds for x in there})
+    cost = f", {claim['hours']:g} core-hours" if verdict == "open" else ""
+    cells = (
+        str(number),
+        claim["where"],
+        claim["claim"] + (f" *{claim['note']}*" if "note" in claim else ""),
+        claim["published"],
+        ours,
+        " to ".join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1]))) if seeds else "",
+        f"**{verdict}**{cost}",
+        ", ".join(links(x.path for x in there) or sources(claim)),
+    )
+    return "| " + " | ".join(cells) + " |", verdict
+
+
+def links(paths: Iterable[pathlib.Path | None]) -> list[str]:
+    """To the data, each once."""
+    return [
+        f"[{path.parent.parent.name} {path.parent.name}](../../{path.relative_to(ROOT).as_posix()})"
+        for path in dict.fromkeys(paths)
+        if path is not None
+    ]
+
+
+def sources(claim: Mapping[str, Any]) -> list[str]:
+    """The experiments that would have the data, each once."""
+    return [f"`{name}`" for name in dict.fromkeys(part["experiment"] for part in claim["parts"])]
+
+
+def table() -> str:
+    """The count, and all claims by chapter."""
+    rows: dict[int, list[str]] = {}
+    counted: Counter[str] = Counter()
+    for number, claim in enumerate(claims(), start=1):
+        line, verdict = row(number, claim)
+        rows.setdefault(claim["chapter"], []).append(line)
+        counted[verdict] += 1
+    lines = [count(counted), ""]
+    for chapter, told in sorted(rows.items()):
+        lines += [
+            f"## Chapter {chapter}",
+            "",
+            "| | where | claim | published | ours | seeds | verdict | data |",
+            "|---|---|---|---|---|---|---|---|",
+            *told,
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def count(counted: Mapping[str, int]) -> str:
+    """How many claims have which verdict, in one line."""
+    told = ", ".join(f"{counted[name]} {name}" for name in VERDICTS)
+    return f"**{sum(counted.values())} claims: {told}.**"
+
+
+def page() -> tuple[str, str, str]:
+    """The page: what comes before the claims, the claims, what comes after."""
+    before, _, rest = PAGE.read_text("utf-8").partition(BEGIN)
+    inside, _, after = rest.partition(END)
+    return before + BEGIN, inside, END + after
+
+
+if __name__ == "__main__":
+    before, _, after = page()
+    PAGE.write_text(before + table() + after, "utf-8")
+    sys.stdout.write(table().splitlines()[0] + "\n")
