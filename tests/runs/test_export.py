@@ -9,7 +9,7 @@ import pytest
 from safetensors import safe_open
 
 from credo.algorithms.neuroevolution import Neuroevolution
-from credo.environments import adapters
+from credo.environments import spaces
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy
 from credo.environments.sequence_recall import SequenceRecall
@@ -110,7 +110,7 @@ def made(path, env, network, seed=0, action=None, champion=None, **settings) -> 
     champion = champion or network.init(*env.sizes, key=jax.random.key(seed))
     checkpoint.export_policy(path / "champion.safetensors", champion)
     task = {name: getattr(env, name) for name in ("obs_size", "action_size", "agents", "discrete")}
-    task["actions"] = action and adapters._described(action)
+    task["actions"] = action and spaces.described(action)
     record = {"algorithm": config.to_tree(algorithm), "seed": seed, "task": task}
     files.write_json(path / "config.json", record)
     return Run(path, trust=True)
@@ -248,7 +248,7 @@ def test_a_team_in_a_file_acts_in_each_agents_units_and_opens_nothing(tmp_path):
     wrapped = {"class": "credo.environments.wrappers:DelayedHostReward", "env": env}
     run.config["algorithm"]["env"] = wrapped
     run.config["task"] |= {
-        "actions": [adapters._described(box) for box in boxes],
+        "actions": [spaces.described(box) for box in boxes],
         "names": ["a", "b", "c"],
     }
     policy, act = run.policy(), Runner.load(export(run, tmp_path / "p.safetensors"))
@@ -275,7 +275,7 @@ def test_actions_are_those_that_the_worker_gives_the_environment(tmp_path, space
     own = Plant.spaces[space]
     run = made(tmp_path / "run", DelayedHostReward(plant(space)), MLP((5,)), action=own)
     raw, act = run.policy(raw=True), Runner.load(export(run, tmp_path / "p.safetensors"))
-    read = adapters._actions(own).read
+    read = spaces.as_actions(own).read
     expected = [read(raw(obs)[None])[0] for obs in observations()]
     actions, policy = [act(obs) for obs in observations()], run.policy()
     assert all(own.contains(action) for action in actions)

@@ -4,39 +4,30 @@
 process imports this.
 """
 
-import functools
 import importlib
-import inspect
-import sys
-import warnings
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 
 from . import names
+from .makers import called, hear_mujoco, lasting, most_steps, registered
 from .names import Fault
-
-MOST_STEPS = 1000  # of an episode, where neither the task nor its user names a limit
-NO_LIMIT = (
-    f"it names no time limit: an episode is truncated after {MOST_STEPS:,} steps; set "
-    "max_episode_steps, on the command line --max-episode-steps 1000, say"
+from .spaces import (
+    Flat,
+    as_actions,
+    as_choice,
+    as_flat,
+    behind_mask,
+    described,
+    left_out,
+    mask_row,
+    padded_bounds,
+    shown_mask,
+    told_mask,
+    without_mask,
 )
-LASTING = {
-    "NormalizeObservation": "set normalize_observations of the algorithm, which keeps the "
-    "statistics with the policy",
-    "NormalizeReward": "scale the reward by a constant, for example by the learner's reward_scale",
-}
-"""Wrappers whose state outlives an episode, by class name, and what to use instead."""
-
-
-def _most_steps(limits: list[int | None], warnings: list[str]) -> int:
-    """The least of the limits that there are; a warning if there is none."""
-    known = [int(limit) for limit in limits if limit is not None]
-    if not known:
-        warnings.append(NO_LIMIT)
-    return min(known, default=MOST_STEPS)
 
 
 class Single:
@@ -63,7 +54,7 @@ class Single:
             if name:
                 importlib.import_module(module)
             names.register(spec.get("registered"))
-            return _registered(name or module, kwargs, spec["max_episode_steps"])
+            return registered(name or module, kwargs, spec["max_episode_steps"])
         maker = names.resolve(id, gymnasium.Env)
         hear_mujoco()
         env = maker(**kwargs)
@@ -72,20 +63,20 @@ class Single:
         return env
 
     def __init__(self, env: gymnasium.Env, spec: dict[str, Any]):
-        self.warnings = _lasting(env) + _left_out(env.observation_space)
+        self.warnings = lasting(env) + left_out(env.observation_space)
         self.max_steps = self._limit(env, spec["max_episode_steps"])
-        acts = _actions(env.action_space)
+        acts = as_actions(env.action_space)
         self.action_size, self.choices, self._choose = acts.size, list(acts.choices), acts.read
-        self.actions = _described(env.action_space)
-        self._options, seen = sum(acts.choices), _shown_mask(env.observation_space)
+        self.actions = described(env.action_space)
+        self._options, seen = sum(acts.choices), shown_mask(env.observation_space)
         self._seen = seen is not None and seen.shape == (self._options,)
         self.masked = bool(acts.choices) and (self._seen or _masks(env))
-        flat = _flat(env.observation_space, first="action_mask" if self._seen else None)
+        flat = as_flat(env.observation_space, first="action_mask" if self._seen else None)
         if self.masked and not self._seen:
             flat = flat.behind(self._options)
         self.obs_size, self._write, self.obs_dtype = flat.size, flat.write, flat.dtype
         self.obs_range, self.image = flat.bounds, flat.image
-        self.observations = _choice(env.observation_space)
+        self.observations = as_choice(env.observation_space)
         self.said: dict[int, Any] = {}  # by copy: its last observation, as it came
         self._masks: dict[int, np.ndarray] = {}  # by copy: which options it allows next
 
@@ -96,7 +87,7 @@ class Single:
             if isinstance(env, gymnasium.wrappers.TimeLimit):
                 limits.append(env._max_episode_steps)
             env = env.env
-        return _most_steps(limits, self.warnings)
+        return most_steps(limits, self.warnings)
 
     def reset(self, env: gymnasium.Env, seed: int, frame: Any, i: int) -> None:
         """A fresh episode of copy `i`, written to its row of the frame."""
@@ -125,8 +116,8 @@ class Single:
     def _allow(self, obs: Any, info: Any, frame: Any, i: int, over: bool = False) -> None:
         """Remember what copy `i` allows next, as far as it says, and tell it. Behind the end of an
         episode it need not say anything."""
-        told = _told(obs if self._seen else info, self.masked)
-        mask = None if told is None or over else _mask(told, self.choices)
+        told = told_mask(obs if self._seen else info, self.masked)
+        mask = None if told is None or over else mask_row(told, self.choices)
         self._masks.pop(i, None)
         if mask is not None:
             self._masks[i] = mask
@@ -140,41 +131,6 @@ class Single:
             for i, mask in self._masks.items():
                 actions[i, : self._options][~mask] = -np.inf
         return self._choose(actions)
-
-
-def _told(says: Any, masked: bool) -> Any:
-    """The `action_mask` in an observation or an info; None: it has none. Raises `Fault` of one that
-    was not there in the first reset."""
-    told = says.get("action_mask") if isinstance(says, Mapping) else None
-    if told is not None and not masked:
-        raise Fault(
-            "returned an action_mask in step and none in reset",
-            "give it in both, so that learners know that there is one",
-        )
-    return told
-
-
-def _mask(told: Any, choices: Sequence[int]) -> np.ndarray:
-    """An `action_mask` as one row of truth values, an option each. Several choices may have theirs
-    in a tuple, as Gymnasium samples by them."""
-    mask = np.concatenate(told) if isinstance(told, tuple) else np.asarray(told)
-    if mask.shape != (sum(choices),) or mask.dtype.kind not in "biu":
-        options = f"{choices[0]} actions" if len(choices) == 1 else f"{sum(choices)} options"
-        raise Fault(
-            f"returned an action_mask of shape {mask.shape} and dtype {mask.dtype}",
-            f"give one number, 0 or 1, for each of the {options}",
-        )
-    mask = mask.astype(bool)
-    if not all(part.any() for part in np.split(mask, np.cumsum(choices)[:-1])):
-        part = "" if len(choices) == 1 else " for one of its choices"
-        raise Fault(f"allows no action: its action_mask is 0 everywhere{part}", "allow one, or end")
-    return mask
-
-
-def _shown_mask(space: Any) -> Any:
-    """The space of `action_mask` in a Dict of observations; None if there is none."""
-    spaces = getattr(space, "spaces", {})
-    return spaces.get("action_mask") if isinstance(spaces, dict) else None
 
 
 def _masks(env: Any) -> bool:
@@ -211,7 +167,7 @@ class Team:
         if id in getattr(pettingzoo, "parallel_registry", ()):  # since 1.27
             env = pettingzoo.make("parallel", id, **kwargs)
         else:
-            env = _called(id, kwargs, pettingzoo.ParallelEnv)
+            env = called(id, kwargs, pettingzoo.ParallelEnv)
         if not isinstance(env, pettingzoo.ParallelEnv):
             raise Fault(
                 f"is a {type(env).__name__}",
@@ -221,7 +177,7 @@ class Team:
         return env
 
     def __init__(self, env: Any, spec: dict[str, Any]):
-        self.warnings = _lasting(env)
+        self.warnings = lasting(env)
         self.max_steps = self._cycles(env, spec["max_episode_steps"])
         self.names: list[str] = list(getattr(env, "possible_agents", ()))
         if not self.names:
@@ -231,14 +187,14 @@ class Team:
         self._learn_actions(env)
         spaces = [env.observation_space(name) for name in self.names]
         kinds = [(str(space), str(told)) for space, told in zip(spaces, self.actions, strict=True)]
-        self.lengths = [_flat(_without_mask(s) if _shown_mask(s) else s).size for s in spaces]
+        self.lengths = [as_flat(without_mask(s) if shown_mask(s) else s).size for s in spaces]
         self.groups = [list(dict.fromkeys(kinds)).index(kind) for kind in kinds]
-        self._seen = [_shown_mask(space) is not None for space in spaces]
+        self._seen = [shown_mask(space) is not None for space in spaces]
         self.masked = self._uneven or any(self._seen) or (bool(self.choices) and _masks(env))
         flats = [self._flat(space, seen) for space, seen in zip(spaces, self._seen, strict=True)]
         self.obs_size = max(flat.size for flat in flats)
         self.obs_dtype = "uint8" if all(x.dtype == "uint8" for x in flats) else "float32"
-        self.obs_range = [_padded(flat, self.obs_size) for flat in flats]
+        self.obs_range = [padded_bounds(flat, self.obs_size) for flat in flats]
         self.said: dict[int, Any] = {}  # by copy: its last observations, as they came
         self._writes = [(flat.size, flat.write) for flat in flats]
         self._masks: dict[tuple[int, int], np.ndarray] = {}  # by copy and agent: what it may do
@@ -250,8 +206,8 @@ class Team:
     def _learn_actions(self, env: Any) -> None:
         """Each agent's actions, and the choices that all of them are told by."""
         spaces = [env.action_space(name) for name in self.names]
-        self._acts = [_actions(space) for space in spaces]
-        self.actions = [_described(space) for space in spaces]
+        self._acts = [as_actions(space) for space in spaces]
+        self.actions = [described(space) for space in spaces]
         self.action_size = max(acts.size for acts in self._acts)
         kinds = {acts.choices for acts in self._acts}
         self._uneven = len(kinds) > 1
@@ -266,14 +222,14 @@ class Team:
             )
         self.choices = [max(sum(kind) for kind in kinds)] if alone else list(kinds.pop())
 
-    def _flat(self, space: Any, seen: bool) -> "_Flat":
+    def _flat(self, space: Any, seen: bool) -> "Flat":
         """An agent's observations, behind what it may do if there is such a thing."""
-        flat = _flat(_without_mask(space) if seen else space)
+        flat = as_flat(without_mask(space) if seen else space)
         return flat.behind(sum(self.choices)) if self.masked else flat
 
     def _cycles(self, env: Any, limit: int | None) -> int:
         """PettingZoo has no wrapper for time limits; `max_cycles` is its custom."""
-        return _most_steps([limit, getattr(env.unwrapped, "max_cycles", None)], self.warnings)
+        return most_steps([limit, getattr(env.unwrapped, "max_cycles", None)], self.warnings)
 
     def _first_step(self, env: Any) -> tuple[list[str], Any, Any]:
         """Who acted in a first step with the middle of every Box, or the first options that are
@@ -348,7 +304,7 @@ class Team:
             size, write = self._writes[k]
             said = _said("observation", obs, name)
             if self._seen[k]:
-                said = _behind_mask(said)
+                said = behind_mask(said)
             write(said, frame.obs[i, k, :size])
 
     def _allow(self, obs: Any, infos: Any, here: list[str], frame: Any, i: int) -> None:
@@ -366,23 +322,9 @@ class Team:
         """What the agents of copy `i` may do next."""
         for name, k in self._rows.items():
             self._masks.pop((i, k), None)
-            told = _told(obs.get(name) if self._seen[k] else infos.get(name), self.masked)
+            told = told_mask(obs.get(name) if self._seen[k] else infos.get(name), self.masked)
             if told is not None and name in here:
-                self._masks[i, k] = _mask(told, self._acts[k].choices)
-
-
-def _without_mask(space: Any) -> gymnasium.Space:
-    """What a Dict of observations has beside `action_mask`: that alone, if it is one thing."""
-    rest = {key: part for key, part in space.spaces.items() if key != "action_mask"}
-    return next(iter(rest.values())) if len(rest) == 1 else gymnasium.spaces.Dict(rest)
-
-
-def _behind_mask(said: Any) -> Any:
-    """Of an observation what `_without_mask` has of its space."""
-    if not isinstance(said, Mapping):
-        raise Fault(f"returned an observation of type {type(said).__name__}", "return a dict")
-    rest = {key: part for key, part in said.items() if key != "action_mask"}
-    return next(iter(rest.values())) if len(rest) == 1 else rest
+                self._masks[i, k] = mask_row(told, self._acts[k].choices)
 
 
 TEAM_STEP = "(observations, rewards, terminations, truncations, infos)"
@@ -495,24 +437,6 @@ def _named(infos: Any, agent: str) -> Mapping[str, Any] | None:
     return said if isinstance(said, dict) else None
 
 
-def _called(id: str, kwargs: dict[str, Any], kind: type) -> Any:
-    """What `package.module:name`, or a module's `parallel_env`, makes."""
-    name, _, entry = id.partition(":")
-    id = f"{name}:{entry or 'parallel_env'}"
-    if names.find(id) is None and not names.here_alone(id):
-        raise Fault(
-            f"is no team task: {name} has no {entry or 'parallel_env'}",
-            "name a module of PettingZoo, such as mpe2.simple_spread_v3, or as package.module:name "
-            "what makes a ParallelEnv",
-        )
-    maker = names.resolve(id, kind)
-    # mpe2 hides the arguments of its parallel_env behind **kwargs.
-    makers = [maker] if entry else [maker, getattr(sys.modules[name], "raw_env", maker)]
-    if any("continuous_actions" in inspect.signature(m).parameters for m in makers):
-        kwargs = {"continuous_actions": True} | kwargs
-    return maker(**kwargs)
-
-
 def _said(what: str, said: Any, name: str) -> Any:
     """What is said of one agent."""
     if isinstance(said, dict) and name in said:
@@ -524,336 +448,6 @@ def _said(what: str, said: Any, name: str) -> Any:
             f"returned no {what} of {name!r}", "return one for every agent that was or is there"
         )
     return said[name]
-
-
-def _registered(id: str, kwargs: dict[str, Any], max_episode_steps: int | None) -> gymnasium.Env:
-    """One environment of an id in Gymnasium's registry; the module of its class is imported first,
-    so that MuJoCo is there to be heard."""
-    with warnings.catch_warnings():  # -v4 tasks are asked for on purpose
-        warnings.filterwarnings("ignore", r".*is out of date", DeprecationWarning)
-        try:
-            entry = gymnasium.spec(id).entry_point
-        except gymnasium.error.NameNotFound as error:
-            raise Fault(
-                f"is unknown to Gymnasium here ({error})",
-                "look at the id, and whether its package is installed; if a module registers it "
-                f"when it is imported, name that too, as in my_module:{id}",
-            ) from error
-        if isinstance(entry, str):
-            importlib.import_module(entry.partition(":")[0])
-        hear_mujoco()
-        return gymnasium.make(id, max_episode_steps, disable_env_checker=True, **kwargs)
-
-
-def hear_mujoco() -> None:
-    """MuJoCo would write its warnings to a file in the working directory, once for every copy."""
-    mujoco = sys.modules.get("mujoco")
-    if mujoco is not None and mujoco.get_mju_user_warning() is None:
-        mujoco.set_mju_user_warning(_tell)
-
-
-@functools.cache  # each once
-def _tell(warning: str) -> None:
-    """Print a warning of MuJoCo to the error stream."""
-    if "'settotalmass' is deprecated" not in warning:  # in Gymnasium's half_cheetah.xml
-        print(f"MuJoCo: {warning}", file=sys.stderr)
-
-
-def _lasting(env: Any) -> list[str]:
-    """Warnings of wrappers whose state outlives an episode."""
-    kinds: dict[str, None] = {}
-    for _ in range(100):  # layers
-        kinds |= {cls.__name__: None for cls in type(env).__mro__}
-        env = getattr(env, "__dict__", {}).get("env")
-    return [
-        f"its wrapper {name} keeps statistics from episode to episode, in every copy its own, so "
-        f"that training, tests and later use are different tasks: leave it out and {instead}"
-        for name, instead in LASTING.items()
-        if name in kinds
-    ]
-
-
-class _Flat(NamedTuple):
-    """An observation space as one row of numbers.
-
-    Box: flattened. Discrete: one-hot. What is made of them: one after the other.
-    """
-
-    size: int
-    dtype: str  # "uint8" if it is made of Boxes of uint8 alone, else "float32"
-    low: np.ndarray  # [size], float64
-    high: np.ndarray
-    write: Callable[[Any, np.ndarray], None]  # an observation into a row
-    image: tuple[int, ...] | None = None  # where the first image begins, and its shape
-
-    @property
-    def bounds(self) -> list[Any]:
-        """The least and the largest of each number; one number where all are the same."""
-        return [x[0] if x.size and (x == x[0]).all() else x.tolist() for x in self[2:4]]
-
-    def behind(self, n: int) -> "_Flat":
-        """The same row behind n numbers, from 0 to 1, that others write."""
-        low, high = np.append(np.zeros(n), self.low), np.append(np.ones(n), self.high)
-        image = self.image and (n + self.image[0], *self.image[1:])
-        write = lambda obs, row: self.write(obs, row[n:])  # noqa: E731
-        return _Flat(n + self.size, self.dtype, low, high, write, image)
-
-
-def _flat(space: gymnasium.Space, said: str = "an observation", first: str | None = None) -> _Flat:
-    """How observations of `space` become a row; of a Dict that with the part `first` in front.
-    `said` names them in a `Fault`, which is raised of a space that NumPy cannot hold (Graph,
-    Sequence)."""
-    spaces = gymnasium.spaces
-    if not _told_in_numbers(space):
-        raise Fault(
-            f"has the observation space {space}",
-            "use a Box, a Discrete, or a Dict or Tuple of them",
-        )
-    if isinstance(space, spaces.Box):
-        low, high = (np.float64(bound).ravel() for bound in (space.low, space.high))
-        small = space.dtype == np.uint8
-        write = _box_writer(space, said)
-        image = (0, *space.shape) if len(space.shape) == 3 else None
-        return _Flat(low.size, "uint8" if small else "float32", low, high, write, image)
-    if isinstance(space, spaces.Dict):
-        parts = {key: part for key, part in space.spaces.items() if _told_in_numbers(part)}
-        if first is not None:
-            parts = {first: parts[first]} | parts
-        return _joined(space, parts, Mapping, said)
-    if isinstance(space, spaces.Tuple):
-        return _joined(space, dict(enumerate(space.spaces)), (tuple, list), said)
-
-    def write_other(obs: Any, row: np.ndarray) -> None:
-        if not space.contains(obs):
-            raise Fault(
-                f"returned {said} of {obs!r}",
-                f"its observation_space is {space}: make the two agree",
-            )
-        row[:] = spaces.flatten(space, obs)
-
-    size, hot = spaces.flatdim(space), not isinstance(space, spaces.Text)
-    low, high = (0.0, 1.0) if hot else (-np.inf, np.inf)
-    return _Flat(size, "float32", np.full(size, low), np.full(size, high), write_other)
-
-
-def _told_in_numbers(space: Any) -> bool:
-    """Whether a space is one, or is made of such, that an array can hold; of a Dict some part."""
-    if isinstance(space, gymnasium.spaces.Dict):
-        return any(map(_told_in_numbers, space.spaces.values()))
-    try:
-        return isinstance(space, gymnasium.Space) and space.is_np_flattenable
-    except NotImplementedError:  # of a space of its own that does not say
-        return False
-
-
-def _left_out(space: Any) -> list[str]:
-    """Warnings of parts of a Dict of observations that are no numbers, such as a text of MiniGrid:
-    policies do not see them."""
-    parts = getattr(space, "spaces", None)
-    if not isinstance(parts, Mapping):
-        return []
-    left = [key for key, part in parts.items() if not _told_in_numbers(part)]
-    if len(left) == len(parts):
-        return []
-    return [f"its observation {key!r} is no array of numbers, and is left out" for key in left]
-
-
-def _box_writer(space: Any, said: str) -> Callable[[Any, np.ndarray], None]:
-    """The shape decides; every kind of real number is cast. Bounds are not looked at."""
-    shape, small = space.shape, space.dtype == np.uint8
-
-    def write(obs: Any, row: np.ndarray) -> None:
-        obs = np.asarray(obs)
-        if obs.shape != shape:
-            raise Fault(
-                f"returned {said} of shape {obs.shape}",
-                f"its observation_space says {shape}: make the two agree",
-            )
-        if obs.dtype.kind not in "fuib":
-            raise Fault(f"returned {said} of dtype {obs.dtype}", "return real numbers")
-        if small and obs.dtype != np.uint8 and row.dtype == np.uint8:
-            whole = obs.astype(np.uint8)
-            if not np.array_equal(whole, obs):
-                raise Fault(
-                    f"returned {said} of dtype {obs.dtype} that uint8 cannot hold",
-                    "its observation_space says uint8: make the two agree",
-                )
-            obs = whole
-        row[:] = obs.ravel()
-
-    return write
-
-
-def _joined(space: Any, parts: dict[Any, Any], kind: Any, said: str) -> _Flat:
-    """The parts of a Dict or Tuple, one after the other, each by its own rule."""
-    flats = {key: _flat(part, f"{said} with {key!r}") for key, part in parts.items()}
-    writes, at, image = [], 0, None
-    for key, flat in flats.items():
-        writes.append((key, slice(at, at + flat.size), flat.write))
-        if flat.image and not image:
-            image = (at + flat.image[0], *flat.image[1:])
-        at += flat.size
-
-    def write(obs: Any, row: np.ndarray) -> None:
-        if not isinstance(obs, kind) or len(obs) != len(space.spaces):
-            told = f"the keys {list(obs)}" if isinstance(obs, Mapping) else _kind(obs)
-            raise Fault(
-                f"returned {said} of {told}",
-                f"its observation_space says {list(parts)}: make the two agree",
-            )
-        for key, place, write_part in writes:
-            if kind is Mapping and key not in obs:
-                raise Fault(
-                    f"returned {said} without {key!r}",
-                    f"its observation_space says {list(parts)}: make the two agree",
-                )
-            write_part(obs[key], row[place])
-
-    small = all(flat.dtype == "uint8" for flat in flats.values())
-    low, high = (
-        np.concatenate([np.zeros(0), *bounds])
-        for bounds in ([x.low for x in flats.values()], [x.high for x in flats.values()])
-    )
-    return _Flat(at, "uint8" if small and flats else "float32", low, high, write, image)
-
-
-def _kind(x: Any) -> str:
-    """Type and length of what was returned, for a message."""
-    length = f" and length {len(x)}" if isinstance(x, (tuple, list)) else ""
-    return f"type {type(x).__name__}{length}"
-
-
-def _padded(flat: _Flat, size: int) -> list[Any]:
-    """Bounds of an agent's observation that is padded with zeros to `size` numbers."""
-    pad = (0, size - flat.size)
-    return flat._replace(low=np.pad(flat.low, pad), high=np.pad(flat.high, pad)).bounds
-
-
-def _choice(space: gymnasium.Space) -> dict[str, int] | None:
-    """A Discrete as JSON; None for what is none."""
-    if not isinstance(space, gymnasium.spaces.Discrete):
-        return None
-    return {"n": int(space.n), "start": int(space.start)}
-
-
-def _described(space: Any) -> dict[str, Any]:
-    """An action space as JSON, for `credo.runner`."""
-    spaces = gymnasium.spaces
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        parts = [[key, _described(part)] for key, part in _parts(space)]
-        return {"parts": parts, "dict": isinstance(space, spaces.Dict)}
-    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
-        form = {"shape": list(space.shape), "dtype": str(space.dtype)}
-        nvec, start = (x.ravel().tolist() for x in _vector(space))
-        return {"nvec": nvec, "start": start, **form}
-    if not isinstance(space, spaces.Box):
-        return _choice(space) or {}
-    low, high = (np.float64(bound).ravel().tolist() for bound in (space.low, space.high))
-    return {"low": low, "high": high, "shape": list(space.shape), "dtype": str(space.dtype)}
-
-
-def _parts(space: Any) -> list[tuple[Any, gymnasium.Space]]:
-    """Those of a Dict or a Tuple."""
-    spaces = space.spaces
-    return list(spaces.items() if isinstance(spaces, Mapping) else enumerate(spaces))
-
-
-def _vector(space: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Options of each choice of a MultiDiscrete or a MultiBinary, and the first option of each."""
-    if isinstance(space, gymnasium.spaces.MultiDiscrete):
-        return np.asarray(space.nvec), np.asarray(space.start)
-    return np.full(space.shape, 2), np.zeros(space.shape, space.dtype)
-
-
-class _Acts(NamedTuple):
-    """An action space as numbers in [-1, 1]: those of its choices, one for each option, and behind
-    them those of its Boxes."""
-
-    size: int
-    choices: tuple[int, ...]  # options of each
-    read: Callable[[np.ndarray], Any]  # actions [n, act] as the space's own, one by one
-
-
-def _actions(space: gymnasium.Space) -> _Acts:
-    """How actions are told. Box: -1 is its low, 1 its high. Discrete, MultiDiscrete, MultiBinary:
-    of each choice the entry that is largest. Dict, Tuple: those of its parts."""
-    choices = tuple(_options(space))
-    cursor = [0, sum(choices)]  # where the next choice begins, and the next Box
-    read = _reader(space, cursor)
-    return _Acts(cursor[1], choices, read)
-
-
-def _options(space: Any) -> list[int]:
-    """Options of each choice in a space, in order. Raises `Fault` of a space that has others."""
-    spaces = gymnasium.spaces
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        return [n for _, part in _parts(space) for n in _options(part)]
-    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
-        return [int(n) for n in _vector(space)[0].ravel()]
-    if isinstance(space, spaces.Discrete):
-        return [int(space.n)]
-    if isinstance(space, spaces.Box):
-        return []
-    raise Fault(
-        f"has the action space {space}",
-        "use a Box, a Discrete, a MultiDiscrete, a MultiBinary, or a Dict or Tuple of them",
-    )
-
-
-def _reader(space: Any, cursor: list[int]) -> Callable[[np.ndarray], Any]:
-    """What reads actions of a space from numbers at `cursor`, which is moved on."""
-    spaces = gymnasium.spaces
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        keys, parts = zip(*_parts(space), strict=True)
-        readers = [_reader(part, cursor) for part in parts]
-        made = dict if isinstance(space, spaces.Dict) else lambda pairs: tuple(x for _, x in pairs)
-        return lambda actions: [
-            made(zip(keys, own, strict=True))
-            for own in zip(*(read(actions) for read in readers), strict=True)
-        ]
-    if isinstance(space, spaces.Box):
-        return _scaled(space, cursor)
-    return _chosen(space, cursor)
-
-
-def _chosen(space: Any, cursor: list[int]) -> Callable[[np.ndarray], np.ndarray]:
-    """Of a Discrete, a MultiDiscrete or a MultiBinary."""
-    sizes, start = _options(space), cursor[0]
-    cursor[0] += sum(sizes)
-    if isinstance(space, gymnasium.spaces.Discrete):
-        first, end = space.start, cursor[0]
-        return lambda actions: np.argmax(actions[:, start:end], axis=1) + first
-    ends, firsts = np.cumsum(sizes) + start, _vector(space)[1]
-
-    def read(actions: np.ndarray) -> np.ndarray:
-        each = [
-            np.argmax(actions[:, end - n : end], axis=1) for end, n in zip(ends, sizes, strict=True)
-        ]
-        own = np.stack(each, axis=1).reshape(-1, *space.shape) + firsts
-        return own.astype(space.dtype)
-
-    return read
-
-
-def _scaled(space: Any, cursor: list[int]) -> Callable[[np.ndarray], np.ndarray]:
-    """Of a Box."""
-    low, high = (np.float64(bound).ravel() for bound in (space.low, space.high))
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise Fault(
-            f"has an action space without bounds: {space}",
-            "give its Box a finite low and high: actions in [-1, 1] are scaled to them",
-        )
-    center, half = (low + high) / 2, (high - low) / 2
-    shape, dtype = space.shape, space.dtype
-    whole, at, end = not np.issubdtype(dtype, np.floating), cursor[1], cursor[1] + low.size
-    cursor[1] = end
-
-    def read(actions: np.ndarray) -> np.ndarray:
-        own = np.minimum(np.maximum(center + half * actions[:, at:end], low), high)
-        own = np.rint(own) if whole else own
-        return own.astype(dtype).reshape(-1, *shape)
-
-    return read
 
 
 def _count(result: Any, n: int, where: str, parts: str) -> None:

@@ -13,7 +13,7 @@ import equinox as eqx
 
 from .. import require
 from . import bodies, others
-from .adapters import hear_mujoco
+from .makers import hear_mujoco
 
 if importlib.util.find_spec("brax") is None:
     raise ModuleNotFoundError("tasks of Brax need it: `pip install brax`")

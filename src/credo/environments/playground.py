@@ -15,7 +15,7 @@ import jax
 
 from .. import require
 from . import bodies, others
-from .adapters import hear_mujoco
+from .makers import hear_mujoco
 
 if importlib.util.find_spec("mujoco_playground") is None:
     raise ModuleNotFoundError("tasks of MuJoCo Playground need it: `pip install playground`")

@@ -54,9 +54,9 @@ TRAINERS = {
 }
 GENERATIONS = {  # by gradient: thousands of instances; recall still improves after 200
     ("classification", "evolution"): {"smoke": 20, "quick": 300, "full": 1000, "published": 15_000},
-    ("classification", "gradient"): {"smoke": 10, "quick": 60, "full": 200},
+    ("classification", "gradient"): {"smoke": 10, "quick": 60, "full": 200, "published": 1000},
     ("recall", "evolution"): {"smoke": 10, "quick": 500, "full": 10_000, "published": 15_000},
-    ("recall", "gradient"): {"smoke": 10, "quick": 60, "full": 400},
+    ("recall", "gradient"): {"smoke": 10, "quick": 60, "full": 400, "published": 1000},
 }
 INFOMAX = InfoMax(generations=500)
 RUNS = {"smoke": 2, "quick": 3, "full": 10, "published": 3}
@@ -71,10 +71,10 @@ LINE = ("preset", "trainer", "network", "memory", "info-max", "at equal instance
 
 # Depths of the task, by budget.
 CLASSIFICATION = {"smoke": (3,), "quick": (2, 5, 10, 21), "full": (2, 3, 4, 5, 6, 10, 15, 21)}
-DEEPEST = {"smoke": (3,), "quick": (21,), "full": (21,)}
+DEEPEST = {"smoke": (3,), "quick": (21,), "full": (21,), "published": (21,)}
 COMPARED = {"smoke": (3,), "quick": (2, 4, 6), "full": (2, 3, 4, 5, 6)}
 COMPARED |= {"published": COMPARED["full"]}
-EVEN = {"smoke": (2,), "quick": (2, 4, 6), "full": (2, 4, 6)}
+EVEN = {"smoke": (2,), "quick": (2, 4, 6), "full": (2, 4, 6), "published": (2, 4, 6)}
 RECALL = {"smoke": (2,), "quick": (1, 2, 3, 4, 6), "full": (1, 2, 3, 4, 5, 6)}
 RECALLED = RECALL | {"quick": (2, 4, 6), "published": RECALL["full"]}
 
