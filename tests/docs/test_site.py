@@ -1,6 +1,8 @@
 """The site builds without a warning, names every public name, and what it says of data is so."""
 
+import fcntl
 import importlib.util
+import os
 import pathlib
 import re
 import subprocess
@@ -35,9 +37,22 @@ def loaded(path: str):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The built site."""
+    """The built site: one for all processes of pytest, since pages are generated beside their
+    source."""
     pytest.importorskip("sphinx", reason="sphinx is of the extra docs")
-    target = tmp_path_factory.mktemp("site")
+    base = tmp_path_factory.getbasetemp()
+    target = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "site"
+    target.mkdir(exist_ok=True)
+    with (target / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (target / "built").exists():
+            build(target)
+            (target / "built").touch()
+    return target / "html"
+
+
+def build(target):
+    """Build the site into a folder."""
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
     built = subprocess.run(
         [*command, "-d", str(target / "doctrees"), str(ROOT / "docs"), str(target / "html")],
@@ -45,7 +60,6 @@ def site(tmp_path_factory):
         text=True,
     )
     assert built.returncode == 0, built.stderr
-    return target / "html"
 
 
 @pytest.mark.slow

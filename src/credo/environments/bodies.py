@@ -81,10 +81,6 @@ class AbstractBodies(others.AbstractOther):
     def _made(self) -> Made:
         """The environment."""
 
-    @property
-    def form(self) -> others.Form:
-        return self._made.form
-
     def reset(self, *, key: PRNGKeyArray) -> tuple[BodiesState, TimeStep]:
         with others.permissive():
             inner = self._made.reset(key)

@@ -135,10 +135,6 @@ class JaxMARL(others.AbstractOther):
         return _made(self.id, self.kwargs)
 
     @property
-    def form(self) -> others.Form:
-        return self._made.form
-
-    @property
     def agents(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return len(self._made.spaces)
 

@@ -110,10 +110,6 @@ class Jumanji(others.AbstractOther):
     def _made(self) -> _Made:
         return _made(self.id, self.kwargs)
 
-    @property
-    def form(self) -> others.Form:
-        return self._made.form
-
     def reset(self, *, key: PRNGKeyArray) -> tuple[PuzzleState, TimeStep]:
         with others.permissive():
             inner, first = self._made.reset(jax.random.key_data(key))

@@ -129,8 +129,12 @@ class AbstractOther(AbstractEnvironment):
 
     @property
     @abc.abstractmethod
+    def _made(self) -> Any:
+        """The environment, with its `form`. `ValueError` where it cannot be made."""
+
+    @property
     def form(self) -> Form:
-        """Its sizes. `ValueError` where it cannot be made."""
+        return self._made.form
 
     @property
     def choices(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
