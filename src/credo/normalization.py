@@ -56,6 +56,14 @@ class Moments(eqx.Module):
         ones = jnp.ones(shape, jnp.float32)
         return cls(jnp.zeros(team, jnp.int32), jnp.zeros(shape, jnp.float32), ones, env.barrable)
 
+    @classmethod
+    def of_returns(cls, env: Environment) -> "Moments":
+        """Before any was paid: as `first`, of one number."""
+        _, _, *team = env.sizes
+        shape = (*team, 1)
+        zeros, ones = jnp.zeros(shape, jnp.float32), jnp.ones(shape, jnp.float32)
+        return cls(jnp.zeros(team, jnp.int32), zeros, ones)
+
     @property
     def std(self) -> Float[Array, "*agents obs"]:
         """Never 0: of a constant it is what float32 cannot resolve."""
@@ -81,7 +89,7 @@ class Moments(eqx.Module):
         """With all that was met in a rollout."""
         rows, valid = experience.transitions, experience.valid
         if valid is not None:
-            return _with_rows(self, rows.obs, rows.active, valid)
+            return with_rows(self, rows.obs, rows.active, valid)
         moments = self
         for start in range(0, len(rows.obs), BLOCK):  # from outside JAX: their number is data
             obs = np.asarray(rows.obs[start : start + BLOCK], np.float64)
@@ -92,7 +100,9 @@ class Moments(eqx.Module):
 
 
 @jit
-def _with_rows(moments: Moments, obs: Array, active: Any, valid: Array) -> Moments:
+def with_rows(moments: Moments, obs: Array, active: Any, valid: Array) -> Moments:
+    """With rows `obs[rows, *agents, obs]`, of those that are `valid` and of agents `active` then;
+    None: all are."""
     return _merged(moments, *_summary(obs.astype(jnp.float32), valid, active, jnp))
 
 

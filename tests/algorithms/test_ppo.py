@@ -10,7 +10,17 @@ import pytest
 from compilations import compilations
 from walk import HostWalk
 
-from credo.algorithms.ppo import PPO, Actor, Choice, Sample, advantages, improve, prepare, surrogate
+from credo.algorithms.ppo import (
+    PPO,
+    Actor,
+    Choice,
+    Sample,
+    advantages,
+    earned,
+    improve,
+    prepare,
+    surrogate,
+)
 from credo.compilation import jit
 from credo.environments.passive_tmaze import PassiveTMaze
 from credo.environments.probes import Copy, Meet
@@ -20,6 +30,7 @@ from credo.networks.exploration import Categorical
 from credo.networks.mlp import MLP, Critic
 from credo.networks.recurrent import Recurrent
 from credo.networks.team import Team
+from credo.normalization import Moments
 from credo.replay import Replay
 
 SMALL = {
@@ -47,6 +58,47 @@ def test_advantages_by_hand():
     goes_on = jnp.array([True, False, True, False])
     expected = [1.0 + 0.5 * 2.0, 2.0, 4.0 + 0.5 * 8.0, 8.0]
     np.testing.assert_allclose(advantages(delta, goes_on, 0.5), expected)
+
+
+def test_rewards_are_divided_by_the_deviation_of_discounted_returns(trained):
+    """Against a plain loop over the frames of a generation, and the same whatever their unit."""
+    ppo, state, _ = trained
+    rows, n = state.replay.data, int(state.replay.size)
+    reward = np.asarray(rows.rewards["reward"][:n], np.float64)
+    over = np.asarray(rows.terminated | rows.truncated)[:n]
+    returns, so_far = [], 0.0
+    for paid, ends in zip(reward, over, strict=True):
+        so_far = paid + float(ppo.gamma) * so_far
+        returns.append(so_far)
+        so_far = 0.0 if ends else so_far
+    seen = earned(ppo, Moments.of_returns(ppo.env), state.replay)
+    assert seen is not None
+    assert int(seen.count) == n
+    np.testing.assert_allclose(seen.std[0], np.std(returns), rtol=1e-3)
+    networks = (state.actor, state.critic)
+    sample = prepare(ppo, networks, state.replay, None, seen)
+    large = dataclasses.replace(rows, rewards={"reward": 1000.0 * rows.rewards["reward"]})
+    replay = dataclasses.replace(state.replay, data=large)
+    other = prepare(ppo, networks, replay, None, earned(ppo, Moments.of_returns(ppo.env), replay))
+    np.testing.assert_allclose(other.value[:n], sample.value[:n], rtol=1e-2, atol=1e-3)
+    plain = prepare(ppo, networks, state.replay)
+    assert not np.allclose(plain.value[:n], sample.value[:n], rtol=1e-2, atol=1e-3)
+
+
+@pytest.mark.parametrize(("env", "network"), [(Copy(), SMALL["network"]), (Meet(), None)])
+def test_it_learns_from_normalised_rewards_alone_and_in_a_team(env, network):
+    given = SMALL | {"network": network}
+    ppo = PPO.ppo(
+        env, horizon=160, copies=16, learning_rate=3e-3, test_every=1, normalize_rewards=True,
+        **{name: x for name, x in given.items() if x is not None},
+    )  # fmt: skip
+    state, generation = jit(ppo.init)(key=jax.random.key(0)), jit(ppo.generation)
+    scores = []
+    for i in range(25):
+        state, metrics = generation(state, key=jax.random.fold_in(jax.random.key(1), i))
+        scores.append(float(metrics["champion_score"]))
+    assert np.mean(scores[-3:]) > scores[0]
+    assert np.isfinite(state.paid.std).all()
 
 
 def test_the_objective_is_clipped_where_that_makes_it_worse(trained):

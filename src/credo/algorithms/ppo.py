@@ -2,10 +2,10 @@
 generalized advantages (equation 11): the on-policy baseline of Chapter 5.
 
 Departures: a generation plays whole episodes, as many as last time's length says `horizon` frames
-need (at most `copies`), so that its end is a state to resume from. Rewards are not
-normalised, and observations only with `normalize_observations`; most implementations do both in
-silence. The
-clipped gradient, the first deviation and the tanh around the mean are not the paper's.
+need (at most `copies`), so that its end is a state to resume from. Observations and rewards are
+normalised with `normalize_observations` and `normalize_rewards` alone; most implementations do both
+in silence. The clipped gradient, the first deviation and the tanh around the mean are not the
+paper's.
 
 A team's agents learn independently (de Witt et al. 2020, "Is independent learning all you need in
 the StarCraft multi-agent challenge?"): each by its own observations, with a critic that all share.
@@ -33,7 +33,7 @@ from ..networks.exploration import Categorical, Explorer, GaussianNoise
 from ..networks.history import HistoryCriticNetwork, remembering, through
 from ..networks.mlp import MLP, AbstractCriticNetwork, Critic
 from ..networks.team import Team
-from ..normalization import Moments, behind, frozen, seen, warmed, watched
+from ..normalization import Moments, behind, frozen, seen, warmed, watched, with_rows
 from ..replay import Replay, extend
 from ..rollout import Environment, blank, collect
 from ..types import Metrics, Transition
@@ -147,6 +147,7 @@ class PPOState(eqx.Module):
     length: Float[Array, ""]  # mean frames of an episode, last time
     frames: Int[Array, ""]
     moments: Moments | None  # of all observations; None: they are not normalised
+    paid: Moments | None = None  # of all discounted returns; None: rewards are not normalised
 
 
 class PPO(eqx.Module):
@@ -180,6 +181,9 @@ class PPO(eqx.Module):
     normalize_observations: bool = eqx.field(static=True, default=False)
     """Actor and critic see observations normalised by the running mean and variance of all
     observations so far; the champion keeps them."""
+    normalize_rewards: bool = eqx.field(static=True, default=False)
+    """The learner sees rewards divided by the standard deviation of all discounted returns so far,
+    and clipped to [-10, 10], as in OpenAI's Baselines. What is reported stays as it is."""
 
     def __check_init__(self):
         require.fits(self.env, self.network, self)
@@ -250,6 +254,7 @@ class PPO(eqx.Module):
             length=jnp.float32(min(self.horizon, env.max_steps)),
             frames=jnp.int32(0),
             moments=moments,
+            paid=Moments.of_returns(env) if self.normalize_rewards else None,
         )
 
     @float32()
@@ -270,9 +275,9 @@ class PPO(eqx.Module):
         frames = state.frames + new
 
         # Compute advantages; optimize the surrogate with K epochs of minibatches.
-        networks = (state.actor, state.critic)
+        networks, paid = (state.actor, state.critic), earned(self, state.paid, replay)
         actor, critic, opt, metrics = improve(
-            self, networks, state.optimizer, replay, state.moments, key=learn_key
+            self, networks, state.optimizer, replay, (state.moments, paid), key=learn_key
         )
         champion, moments = frozen(state.moments, actor.mean), watched(state.moments, experience)
 
@@ -290,7 +295,7 @@ class PPO(eqx.Module):
         }
         state = replace(state, actor=actor, critic=critic, optimizer=opt, replay=replay)
         state = replace(state, champion=champion, score=score, length=length, frames=frames)
-        return replace(state, moments=moments), metrics
+        return replace(state, moments=moments, paid=paid), metrics
 
     def warm(self, state: PPOState, policy: AbstractPolicy) -> PPOState:
         """`state` that goes on from a saved policy of the same network."""
@@ -305,12 +310,12 @@ def improve(
     networks: Networks,
     opt: optax.OptState,
     replay: Replay,
-    moments: Any = None,
+    moments: tuple[Moments | None, Moments | None] = (None, None),
     *,
     key: Any,
 ) -> tuple[Actor | Choice, AbstractCriticNetwork, optax.OptState, Metrics]:
     """K epochs of minibatches of M frames. How many frames there are is data."""
-    sample = prepare(ppo, networks, replay, moments)
+    sample = prepare(ppo, networks, replay, *moments)
     together = ppo.window if sample.begins is not None else 1  # rows that stay together
     pieces = -(-replay.capacity // together)
     some = min(max(ppo.batch_size // together, 1), pieces)
@@ -341,7 +346,33 @@ def improve(
     return actor, critic, opt, averaged(total, ppo.epochs * batches)
 
 
-def prepare(ppo: PPO, networks: Networks, replay: Replay, moments: Moments | None = None) -> Sample:
+@jit
+def earned(ppo: PPO, paid: Moments | None, replay: Replay) -> Moments | None:
+    """The statistics of discounted returns with those of all frames: of each what was paid before
+    it in its episode, as it was then discounted."""
+    if paid is None:
+        return None
+    rows: Transition = replay.data
+    reward = _by_agent(rows.rewards[objective(ppo.env, ppo.signal)], rows)
+    over = _by_agent(rows.terminated | rows.truncated, rows)
+    begins = jnp.concatenate([jnp.ones_like(over[:1]), over[:-1]])
+
+    def on(so_far, row):
+        now = row[0] + ppo.gamma * jnp.where(row[1], 0.0, so_far)
+        return now, now
+
+    returns = jax.lax.scan(on, jnp.zeros_like(reward[0]), (reward, begins))[1]
+    filled = jnp.arange(replay.capacity) < replay.size
+    return with_rows(paid, returns[..., None], rows.active, filled)
+
+
+def prepare(
+    ppo: PPO,
+    networks: Networks,
+    replay: Replay,
+    moments: Moments | None = None,
+    paid: Moments | None = None,
+) -> Sample:
     """Advantages by equation 11 and what goes with them, normalised over the frames; observations
     as they were when the policy acted."""
     actor, critic = networks
@@ -352,6 +383,8 @@ def prepare(ppo: PPO, networks: Networks, replay: Replay, moments: Moments | Non
     reward, terminated, truncated = (
         _by_agent(x, rows) for x in (reward, rows.terminated, rows.truncated)
     )
+    if paid is not None:
+        reward = jnp.clip(reward / paid.std[None, ..., 0], -10.0, 10.0)
     over = terminated | truncated
     if rows.obs.ndim > 2:
         filled = _by_agent(filled, rows) & (rows.active if rows.active is not None else True)

@@ -38,7 +38,13 @@ from .views import Curves, Of, Table, each, known, mean, of_metric, plain, publi
 BUDGETS = (*THREE, "million", "published")
 TASKS = ("HalfCheetah-v5", "Swimmer-v5", "Reacher-v5", "Ant-v5", "Hopper-v5", "Walker2d-v5")
 STAND_IN = "InvertedPendulum-v5"  # for every task at smoke, with tiny networks
-METHODS = {"erl": ERL.erl, "ea": ERL.ea, "ddpg": OffPolicy.ddpg, "ppo": PPO.ppo}
+METHODS = {
+    "erl": ERL.erl,
+    "ea": ERL.ea,
+    "ddpg": OffPolicy.ddpg,
+    # As in OpenAI's Baselines, which the dissertation ran.
+    "ppo": partial(PPO.ppo, normalize_observations=True, normalize_rewards=True),
+}
 WITH, WITHOUT = "erl", "erl without selection"
 SELECTION = {WITH: ERL.erl, WITHOUT: partial(ERL.erl, selection=Uniform())}
 
