@@ -84,11 +84,13 @@ class Runner:
 
         **Arguments:**
 
-        - `observation`: `obs_size` numbers in an array of any shape, or in a Discrete its integer.
-          Of a team one for each agent, in order, None for one that is not there; or a dict by name
-          of those that are. Of a task that says what is allowed those numbers may stand in front.
+        - `observation`: `obs_size` numbers in an array of any shape, in a Discrete its integer, in
+          a Dict or Tuple what it is made of. Of a team one for each agent, in order, None for one
+          that is not there; or a dict by name of those that are. Of a task that says what is
+          allowed those numbers may stand in front.
         - `mask`: which options of a Discrete, or of each choice of a larger space, one after the
-          other, are allowed; None: what the observation says, or all. Of a team one for each.
+          other, are allowed. A task that has masks needs one, here or in the observation. Of a team
+          one for each agent, None where all are allowed.
 
         **Returns:** in a Box of Gymnasium an array of its shape, dtype and units; in a Discrete
         an integer; in a space of several what Gymnasium has there, a dict, a tuple or an array; for
@@ -141,6 +143,7 @@ class Units:
             raise ValueError(f"choices are {task['choices']}, more than an action or observation")
         self._lengths = self._one_each("lengths", task.get("lengths"))
         self._discrete = task.get("observations") if agents is None else None
+        self._shown = task.get("shown") if agents is None else None
         if self._discrete is not None:
             n, start = self._discrete["n"], self._discrete["start"]
             if n != self.obs_size - self._mask or type(start) is not int:
@@ -165,7 +168,7 @@ class Units:
         if self._mask:  # of a task that takes numbers in [-1, 1] as they are, itself follows it
             mask = None if self._own is None else rows[..., : self._mask] > 0.5
         own = self.own(output, mask)
-        if isinstance(observation, Mapping):
+        if self.agents is not None and isinstance(observation, Mapping):
             return {name: own[k] for k, name in enumerate(self.names) if name in observation}
         if isinstance(own, list):
             rows = zip(observation, own, strict=True)
@@ -206,7 +209,9 @@ class Units:
 
     def _row(self, observation: Any, mask: Any, k: int) -> np.ndarray:
         """The observation of agent k. In a team of others it may be shorter than the largest."""
-        if self._discrete is not None and np.ndim(observation) == 0:
+        if isinstance(observation, Mapping) or (self._shown and isinstance(observation, tuple)):
+            x = _flat(observation, self._shown)
+        elif self._discrete is not None and np.ndim(observation) == 0:
             x = _one_hot(observation, self._discrete["n"], self._discrete["start"])
         else:
             x = np.asarray(observation, np.float32).ravel()
@@ -223,11 +228,21 @@ class Units:
         """An observation with what is allowed in front, which it may have already."""
         own = self.obs_size - self._mask if self._lengths is None else self._lengths[k]
         if x.size == own:
+            if mask is None and self.agents is None:
+                raise ValueError(
+                    "this task says which actions are allowed, and neither a mask was given nor "
+                    "does the observation begin with it: give mask=, ones where all are allowed"
+                )
             options = self._mask if self._own is None else self._own[k][0]
             x = np.append(np.arange(self._mask) < options, x).astype(np.float32)
         if mask is None:
+            if x.size == self.obs_size and not np.isin(x[: self._mask], (0.0, 1.0)).all():
+                raise ValueError(
+                    f"the observation begins with {x[: self._mask]}, and should with what is "
+                    "allowed: 0 or 1 for each option, in front of all else, or give mask="
+                )
             return x
-        allowed = np.asarray(mask, np.bool_).ravel()
+        allowed = _flags(mask)
         if allowed.size > self._mask:
             raise ValueError(f"the mask is {mask}: it must say which of {self._mask} are allowed")
         return np.concatenate(
@@ -269,6 +284,39 @@ def _size(what: str, n: Any, most: int | None = None) -> int:
     return n
 
 
+def _flags(mask: Any) -> np.ndarray:
+    """A mask as one row, also of several choices in a tuple, as Gymnasium samples by them."""
+    parts = mask if isinstance(mask, tuple) and any(np.ndim(x) for x in mask) else (mask,)
+    return np.concatenate([np.asarray(part, np.bool_).ravel() for part in parts])
+
+
+def _flat(observation: Any, shown: Any) -> np.ndarray:
+    """The numbers of a dict or tuple, in the order in which the policy was trained on them."""
+    if shown is None:
+        raise ValueError(
+            f"the observation is a {type(observation).__name__}, of which the policy's record does "
+            "not tell the order of parts: give its numbers, what is allowed first"
+        )
+    if "parts" in shown:
+        rows = []
+        for key, part in shown["parts"]:
+            try:
+                rows.append(_flat(observation[key], part))
+            except (KeyError, IndexError, TypeError) as error:
+                raise ValueError(f"the observation has no part {key!r}: {observation!r}") from error
+        return np.concatenate(rows)
+    if "nvec" in shown:
+        entries, options = np.asarray(observation).ravel(), (shown["nvec"], shown["start"])
+        every = zip(entries, *options, strict=True)
+        return np.concatenate([_one_hot(entry, n, start) for entry, n, start in every])
+    if "n" in shown:
+        return _one_hot(observation, shown["n"], shown["start"])
+    x = np.asarray(observation, np.float32).ravel()
+    if x.size != shown["size"]:
+        raise ValueError(f"a part of the observation has {x.size} numbers: not {shown['size']}")
+    return x
+
+
 def _one_hot(observation: Any, n: int, start: int) -> np.ndarray:
     """`[n]` of an integer from `start` on."""
     entry = np.asarray(observation)
@@ -300,7 +348,7 @@ def _barred(output: np.ndarray, mask: Any, options: int) -> np.ndarray:
         return output
     if not options:
         _no_mask(mask)
-    mask = np.asarray(mask, np.bool_).ravel()
+    mask = _flags(mask)
     if mask.size < options or not mask[:options].any():
         raise ValueError(f"the mask is {mask}: it must allow at least one of {options} entries")
     allowed = np.append(mask[:options], np.ones(output.size - options, np.bool_))

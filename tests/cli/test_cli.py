@@ -24,6 +24,7 @@ from credo.cli.names import ALGORITHMS, COMMANDS, NETWORKS, TASKS, load
 from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Meet, Remember
 from credo.experiments.catalogue import EXPERIMENTS
+from credo.networks.choosing import Choosing
 from credo.networks.mlp import MLP
 from credo.networks.team import Team
 from credo.runs.loop import Interrupted
@@ -1053,6 +1054,25 @@ def test_each_agent_of_a_team_has_a_network_of_its_own():
     assert network(None, "merl", Meet()) is None
 
 
+@pytest.mark.parametrize("words", ["ppo", "merl", "merl --network mlp", "neuroevolution"])
+def test_agents_of_a_kind_may_share_in_any_algorithm(words, monkeypatch):
+    """Who is of a kind only the task knows: a network is fitted before an algorithm refuses it."""
+    pytest.importorskip("pettingzoo")
+    monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parents[1] / "environments"))
+    word, *others = words.split()
+    line = Line("train", [word, "barred:Team", *others, "--network.sharing", "groups"])
+    network = train.algorithm_of(line, line.command(train.Train)).network
+    assert network.network.groups == (0, 1)
+
+
+def test_cerl_trains_a_team(monkeypatch):
+    pytest.importorskip("pettingzoo")
+    monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parents[1] / "environments"))
+    line = Line("train", ["cerl", "barred:Team"])
+    made = train.algorithm_of(line, line.command(train.Train))
+    assert made.network == Choosing(Team(), (3,), masked=True)
+
+
 def test_a_team_of_ones_own_is_given_its_time_limit(credo, tmp_path, monkeypatch):
     pytest.importorskip("pettingzoo")
     monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parents[1] / "environments"))
@@ -1081,7 +1101,6 @@ def test_list_shows_what_teams_need(credo):
     ("words", "told"),
     [
         ("train sac rover", "Rover has 6 agents: SAC cannot learn that. Teams learn by TD3"),
-        ("train cerl rover", "MLP acts for one agent and Rover has 6"),
         ("train neuroevolution Pendulum-v1 --network dmmu", "DMMU acts for a team and Pendulum-v1"),
         ("train matd3 Pendulum-v1", "trains teams and Pendulum-v1 has one agent"),
         ("train matd3 Pendulum-v1 --network mlp", "one agent"),

@@ -11,7 +11,7 @@ from credo.algorithms.off_policy import OffPolicy
 from credo.cli import names, values
 from credo.cli.line import Line
 from credo.environments import wrappers
-from credo.environments.probes import Copy
+from credo.environments.probes import Choose, Copy
 from credo.environments.sequence_recall import SequenceRecall
 from credo.evolution.breeder import Breeder
 from credo.evolution.cem import CEM
@@ -22,8 +22,9 @@ from credo.learners.manager import UCB, AbstractManager, Progress, Thompson, Uni
 from credo.learners.sac import SAC
 from credo.learners.surrogate import Preselection
 from credo.learners.td3 import TD3, ddpg
+from credo.networks.choosing import Choosing
 from credo.networks.exploration import GaussianNoise
-from credo.networks.mlp import ResidualCritic
+from credo.networks.mlp import MLP, ResidualCritic
 from credo.runs import config
 
 
@@ -201,3 +202,14 @@ def test_settings_by_name(words, pairs, seed):
 )
 def test_times(text, seconds):
     assert values.seconds("wall-clock", text) == seconds
+
+
+def test_the_flags_of_a_network_that_chooses_are_those_within():
+    """Each once: named twice, one of two values would win in silence."""
+    line = Line("train", ["--network.hidden", "7"])
+    made: Any = line.take(ERL.erl(Choose(), Choosing(MLP(), (3,))))
+    assert made.network == Choosing(MLP(hidden=(7,)), (3,))
+    assert "network.hidden" in line.known()
+    assert not [name for name in line.known() if name.startswith("network.network")]
+    assert line.inside(made.network, "network") is not made.network  # given again
+    assert Line("train", []).inside(made.network, "network") is made.network

@@ -195,6 +195,7 @@ def test_a_task_says_how_it_takes_actions():
         "lengths": None,
         "actions": {"n": 3, "start": 5},
         "observations": None,
+        "shown": None,
         "names": None,
     }
     numbered = here("Numbered").task_record()

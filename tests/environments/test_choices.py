@@ -248,6 +248,48 @@ def test_a_mask_may_stand_before_the_observation_of_any_agent():
     )
 
 
+def test_a_policy_takes_a_dict_as_the_task_gives_it():
+    """Its parts are in the order of training, what is allowed first; Gymnasium's own flat form has
+    another order, and is refused rather than misread."""
+    env = task("Barred")
+    units, own = Units(env.task_record()), Barred()
+    obs, _ = own.reset(seed=0)
+    np.testing.assert_array_equal(units.read(obs), [*obs["action_mask"], 0.5])
+    with pytest.raises(ValueError, match=r"begins with \[0.5.*give mask="):
+        units.read(gymnasium.spaces.flatten(own.observation_space, obs))
+    with pytest.raises(ValueError, match="has no part 'a first'"):
+        units.read({"action_mask": obs["action_mask"]})
+    shown = {"parts": [["x", {"nvec": [2, 3], "start": [0, 1]}], ["y", {"n": 2, "start": 0}]]}
+    sizes = {"obs_size": 7, "action_size": 1, "shown": shown}
+    read = Units(sizes).read({"y": 1, "x": np.array([1, 3]), "more": "text"})
+    np.testing.assert_array_equal(read, [0, 1, 0, 0, 1, 0, 1])
+    with pytest.raises(ValueError, match="is a dict, of which the policy's record does not tell"):
+        Units(sizes | {"shown": None}).read({"x": 1})
+
+
+@pytest.mark.parametrize("where", ["obs", "info"])
+def test_a_task_with_masks_is_not_played_without_one(where):
+    units = Units(task("Barred", where=where).task_record())
+    with pytest.raises(ValueError, match="neither a mask was given nor does the observation"):
+        units.read([0.5])
+    np.testing.assert_array_equal(units.read([0.5], [0, 1, 1, 0]), [0, 1, 1, 0, 0.5])
+
+
+def test_masks_of_several_choices_may_come_in_a_tuple():
+    units = Units(task("Several", split=True).task_record())
+    read = units.read([0.0], (np.array([0, 1, 1]), np.array([1, 0])))
+    np.testing.assert_array_equal(read, [0, 1, 1, 1, 0, 0])
+
+
+def test_a_network_that_groups_share_is_looked_at_before_groups_are_known():
+    network = TeamNetwork(trunk=(4,), sharing="groups")
+    assert not network.remembers
+    assert TeamNetwork(head=Recurrent("gru", 3), sharing="groups", groups=(0, 0, 1)).remembers
+    three = Choosing(TeamNetwork(trunk=(4,), sharing="groups", groups=(0, 0, 1)), (3,))
+    assert three.speaks
+    assert not three.remembers
+
+
 def test_what_says_discrete_itself_is_refused():
     with pytest.raises(TypeError, match=r"Old sets discrete, which follows from choices: give"):
 

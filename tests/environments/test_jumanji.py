@@ -138,3 +138,15 @@ def test_what_jumanji_does_not_have_is_refused():
         Jumanji("Snak-v1")
     with pytest.raises(ValueError, match="Snake-v1 was not made: TypeError"):
         Jumanji("Snake-v1", {"gravty": 1.0})
+
+
+def test_an_image_is_found_behind_the_mask():
+    env = Jumanji("Snake-v1")
+    assert env.image == (4, 12, 12, 5)
+    with permissive():
+        _, told = jumanji.make("Snake-v1").reset(jax.random.key_data(KEY))
+    start, *shape = env.image
+    _, first = env.reset(key=KEY)
+    seen = first.obs[start : start + np.prod(shape)].reshape(shape)
+    np.testing.assert_array_equal(seen, told.observation.grid)
+    assert Jumanji("Game2048-v1").image is None

@@ -105,6 +105,14 @@ def test_a_task_says_where_its_image_is():
             Convolutional().fitted(env)
 
 
+def test_an_image_cannot_begin_within_a_mask():
+    class Masked(Look):
+        masked = True
+
+    with pytest.raises(ValueError, match=r"start is 0, and the first . numbers"):
+        Convolutional(shape=(6, 6, 1)).fitted(Masked())
+
+
 def test_wrappers_change_nothing_of_an_image():
     for env in (with_last_step(Look()), NoisyObservations(Look(), 1.0), delayed(Look())):
         assert Convolutional().fitted(env) == Convolutional().fitted(Look())

@@ -151,7 +151,8 @@ class ERL(Hybrid):
         sees returns spread over their episodes and joins the population every generation, and many
         elites, ranked by their average fitness. Chosen by looking at the hard double pendulum,
         seeds 0, 100 to 103 and 200 to 202."""
-        network = network or MLP(hidden=(64, 64), activation="relu", initializer="uniform")
+        alone = MLP(hidden=(64, 64), activation="relu", initializer="uniform")
+        network = network or (alone if env.agents is None else Team())
         rates: dict[str, Any] = {"actor_lr": 1e-3, "critic_lr": 1e-3, "batch_size": 128}
         critic = Critic(hidden=(128, 128))
         learner = TD3(critic=critic, gamma=0.999, reward_scale=0.01, **rates)
@@ -190,7 +191,7 @@ class ERL(Hybrid):
         settings = {"learners": learners, "workers": 10, "manager": UCB(), "elite_fraction": 0.2}
         settings |= {"sync_period": 5, "test_episodes": 10, "test_every": 5}
         settings = in_windows(env, network, settings)
-        network = choosing(env, network or TD3_NETWORK)
+        network = choosing(env, network or (TD3_NETWORK if env.agents is None else Team()))
         return cls(env, network, **evolving(BREEDER, settings, overrides))
 
     @classmethod

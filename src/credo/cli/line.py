@@ -125,15 +125,20 @@ class Line:
             elif typed(kind):
                 for words in self._given(at, kind, here, text):
                     here = read(self.flags[at].name, kind, words, here, self.words)
-            here = self._inside(here, at)
+            here = self.inside(here, at)
             new |= {f.name: here} if here is not getattr(value, f.name) else {}
         return dataclasses.replace(value, **new) if new else value
 
-    def _inside(self, value: Any, at: str) -> Any:
+    def inside(self, value: Any, at: str) -> Any:
         """What a field holds, with what the flags say of the objects in it."""
         if isinstance(value, tuple) and any(map(dataclasses.is_dataclass, value)):
             made = tuple(self.take(one, f"{at}.{i}.") for i, one in enumerate(value))
             return made if any(a is not b for a, b in zip(made, value, strict=True)) else value
+        inner: str = getattr(type(value), "flags_of", "")
+        if inner:  # it stands for what is within
+            new = self.inside(getattr(value, inner), at)
+            same = new is getattr(value, inner)
+            return value if same else dataclasses.replace(typing.cast(Any, value), **{inner: new})
         return self.take(value, f"{at}.") if dataclasses.is_dataclass(value) else value
 
     def _given(self, at: str, kind: Any, value: Any, text: str) -> Iterator[list[str]]:
@@ -142,6 +147,7 @@ class Line:
         name, task = OPEN.sub("", full), at.startswith("env.")
         name = full if task and name in self.reserved else name
         self.reserved |= set() if task else {name}
+        self.flags.pop(at, None)  # an object may be taken twice: its last place counts
         self.flags[at] = Flag(name, at, kind, value, text)
         for given in (self.filed, self.given):
             for names in (shorts(at), {name, full}):

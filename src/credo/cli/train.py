@@ -139,10 +139,12 @@ def algorithm_of(line: Line, command: Train) -> Any:
 
         env = with_last_step(env)
     network = _network(line, command.network or ALGORITHMS[word].get("network"), word, env)
-    algorithm = line.take(build(env, network))
-    fitted = algorithm.network.fitted(env)
-    same = fitted == algorithm.network
-    return algorithm if same else dataclasses.replace(algorithm, network=fitted)
+    made = build(env, network)
+    # What only a task knows comes first: an algorithm refuses a network that lacks it.
+    fitted = line.inside(made.network, "network").fitted(env)
+    if fitted != made.network:
+        made = dataclasses.replace(made, network=fitted)
+    return line.take(made)
 
 
 def _task(line: Line, command: Train) -> Any:

@@ -19,6 +19,7 @@ from .spaces import (
     as_actions,
     as_choice,
     as_flat,
+    as_shown,
     behind_mask,
     described,
     left_out,
@@ -77,6 +78,7 @@ class Single:
         self.obs_size, self._write, self.obs_dtype = flat.size, flat.write, flat.dtype
         self.obs_range, self.image = flat.bounds, flat.image
         self.observations = as_choice(env.observation_space)
+        self.shown = as_shown(env.observation_space, "action_mask" if self._seen else None)
         self.said: dict[int, Any] = {}  # by copy: its last observation, as it came
         self._masks: dict[int, np.ndarray] = {}  # by copy: which options it allows next
 
@@ -158,6 +160,7 @@ class Team:
 
     observations: ClassVar[None] = None
     image: ClassVar[None] = None
+    shown: ClassVar[None] = None
 
     @staticmethod
     def make(spec: dict[str, Any]) -> Any:

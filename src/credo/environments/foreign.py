@@ -449,6 +449,7 @@ RECORDED = (
     "lengths",
     "actions",
     "observations",
+    "shown",
     "names",
 )
 _WARNED: set[str] = set()

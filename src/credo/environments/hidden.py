@@ -127,7 +127,8 @@ class HiddenHostEntries(Hiding, AbstractHostWrapper):
     entries: tuple[int, ...] = eqx.field(static=True)  # counted from 0, in order
 
     def task_record(self) -> dict[str, Any]:
-        return self.env.task_record() | {"obs_size": self.obs_size, "observations": None}
+        other = {"obs_size": self.obs_size, "observations": None, "shown": None}
+        return self.env.task_record() | other
 
     def around(self, inner: AbstractCopies) -> "HiddenCopies":
         return HiddenCopies(inner, self.kept)

@@ -53,20 +53,24 @@ def _made(id: str, settings: tuple[tuple[str, Any], ...]) -> _Made:
             functions = jax.jit(env.reset), jax.jit(env.step)
             _, first = jax.eval_shape(env.reset, jax.random.key_data(jax.random.key(0)))
             seen, mask = jax.eval_shape(_parted, first.observation)
+            image = others.image_in(_fields(first.observation))
     except (KeyError, OSError, TypeError) as error:
         raise ValueError(f"{id} was not made: {type(error).__name__}: {error}") from error
     options, choices = _choices(spec, None if mask is None else mask.shape)
     steps = int(getattr(env, "time_limit", None) or others.MOST_STEPS)
     size = sum(choices) or math.prod(spec.shape)
-    form = others.Form(seen.size, size, choices, mask is not None, steps)
+    form = others.Form(seen.size, size, choices, mask is not None, steps, image)
     return _Made(spec, *functions, options, form)
 
 
 def _parted(observation: Any) -> tuple[Float[Array, " obs"], Bool[Array, "..."] | None]:
     """The numbers of an observation, and its mask of actions, if it has one."""
-    fields = dict(observation._asdict())
-    mask = fields.pop("action_mask", None)
-    return others.flat(fields), mask
+    return others.flat(_fields(observation)), observation._asdict().get("action_mask")
+
+
+def _fields(observation: Any) -> dict[str, Any]:
+    """What an observation has beside its mask, by name."""
+    return {name: x for name, x in observation._asdict().items() if name != "action_mask"}
 
 
 def _choices(spec: Any, mask: tuple[int, ...] | None) -> tuple[tuple[int, ...], tuple[int, ...]]:

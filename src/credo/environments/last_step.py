@@ -95,7 +95,8 @@ class LastHostStep(AbstractHostWrapper):
         return -np.inf, np.inf
 
     def task_record(self) -> dict[str, Any]:
-        return self.env.task_record() | {"obs_size": self.obs_size, "observations": None}
+        other = {"obs_size": self.obs_size, "observations": None, "shown": None}
+        return self.env.task_record() | other
 
     def around(self, inner: AbstractCopies) -> "LastStepCopies":
         return LastStepCopies(inner, self.env)

@@ -7,6 +7,7 @@ are told apart.
 import abc
 import contextlib
 import io
+import math
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -101,6 +102,18 @@ def chosen(
     return jnp.stack([jnp.argmax(part) for part in parts])
 
 
+def image_in(tree: PyTree) -> tuple[int, int, int, int] | None:
+    """Of what `flat` puts one after the other the first part with three axes: where it begins, and
+    its height, width and channels. None: there is none."""
+    start = 0
+    for part in jax.tree.leaves(tree):
+        if len(part.shape) == 3:
+            height, width, channels = map(int, part.shape)
+            return start, height, width, channels
+        start += math.prod(part.shape)
+    return None
+
+
 class Form(NamedTuple):
     """What all episodes of an environment have in common."""
 
@@ -109,6 +122,7 @@ class Form(NamedTuple):
     choices: tuple[int, ...] = ()
     masked: bool = False
     max_steps: int = MOST_STEPS
+    image: tuple[int, int, int, int] | None = None  # as `image_in`, without a mask
 
 
 class AbstractOther(AbstractEnvironment):
@@ -147,6 +161,13 @@ class AbstractOther(AbstractEnvironment):
     @property
     def obs_size(self) -> int:
         return self.form.obs_size + self.barrable
+
+    @property
+    def image(self) -> tuple[int, int, int, int] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        if self.form.image is None:
+            return None
+        start, height, width, channels = self.form.image
+        return start + self.barrable, height, width, channels
 
     @property
     def action_size(self) -> int:

@@ -218,6 +218,26 @@ def padded_bounds(flat: Flat, size: int) -> list[Any]:
     return flat._replace(low=np.pad(flat.low, pad), high=np.pad(flat.high, pad)).bounds
 
 
+def as_shown(space: Any, first: str | None = None) -> dict[str, Any] | None:
+    """Of a Dict or a Tuple how `as_flat` makes numbers of it, as JSON, for `credo.runner`; None for
+    any other."""
+    spaces = gymnasium.spaces
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        return None
+    parts = [(key, part) for key, part in _parts(space) if _told_in_numbers(part)]
+    parts.sort(key=lambda part: first is not None and part[0] != first)
+    return {"parts": [[key, as_shown(part) or _entries(part)] for key, part in parts]}
+
+
+def _entries(space: Any) -> dict[str, Any]:
+    """What is no Dict and no Tuple: options of which one is told, or so many numbers."""
+    spaces = gymnasium.spaces
+    if isinstance(space, spaces.MultiDiscrete):
+        nvec, start = (x.ravel().tolist() for x in _vector(space))
+        return {"nvec": nvec, "start": start}
+    return as_choice(space) or {"size": spaces.flatdim(space)}
+
+
 def as_choice(space: gymnasium.Space) -> dict[str, int] | None:
     """A Discrete as JSON; None for what is none."""
     if not isinstance(space, gymnasium.spaces.Discrete):

@@ -43,6 +43,7 @@ SIZES = (
     "signals",
     "actions",
     "observations",
+    "shown",
     "names",
     "obs_range",
     "warnings",

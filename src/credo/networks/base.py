@@ -90,16 +90,31 @@ class AbstractNetwork(eqx.Module):
     """Whether its policies act for all agents; `init` then takes their number behind the sizes."""
 
     @property
-    def least(self) -> int:
-        """Numbers of an observation that it can be made for, to look at its form."""
-        return 2
+    def least(self) -> tuple[int, ...]:
+        """Sizes that it can be made for, to look at its form: of an observation and an action, and
+        of a team the number of agents."""
+        return (2, 1, *(2,) * self.team)
 
     @property
     def remembers(self) -> bool:
         """Whether its policies have memory."""
-        sizes = (self.least, 1, *(2,) * self.team)
-        first = jax.eval_shape(lambda: self.init(*sizes, key=jax.random.key(0)).first())
+        first = jax.eval_shape(lambda: self.init(*self.least, key=jax.random.key(0)).first())
         return first is not None
+
+    @property
+    def speaks(self) -> bool:
+        """Whether its policies tell what they say before their output activation (`spoken`)."""
+        obs_size, _, *team = self.least
+
+        def parts():
+            policy = self.init(*self.least, key=jax.random.key(0))
+            return policy.spoken(jnp.zeros((*team, obs_size)), policy.start(key=jax.random.key(0)))
+
+        try:
+            jax.eval_shape(parts)
+        except NotImplementedError:
+            return False
+        return True
 
     def fitted(self, env: Any) -> Self:
         """With what only a task knows, where it is not given: where its image is, which of its

@@ -13,7 +13,7 @@ closer look at invalid action masking in policy gradient algorithms").
 
 import itertools
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -28,6 +28,8 @@ BARRED = -1e9  # the output of an option that is not allowed: nothing comes near
 class Choosing(AbstractNetwork):
     """Config of a network that chooses."""
 
+    flags_of: ClassVar[str] = "network"  # the command line has the settings of that alone
+
     network: AbstractNetwork  # what it thinks of each option
     choices: tuple[int, ...] = eqx.field(static=True)  # options of each choice; Boxes come behind
     masked: bool = eqx.field(static=True, default=False)
@@ -41,8 +43,16 @@ class Choosing(AbstractNetwork):
         return replace(self, network=self.network.fitted(env))
 
     @property
-    def least(self) -> int:
+    def least(self) -> tuple[int, ...]:
         return self.network.least
+
+    @property
+    def remembers(self) -> bool:
+        return self.network.remembers
+
+    @property
+    def speaks(self) -> bool:
+        return self.network.speaks
 
     def init(self, obs_size: int, action_size: int, *agents: int, key: PRNGKeyArray):
         return ChoosingPolicy(self.network.init(obs_size, action_size, *agents, key=key), self)
@@ -125,25 +135,9 @@ class ChoosingPolicy(AbstractPolicy):
 def choosing(env: Any, network: AbstractNetwork) -> AbstractNetwork:
     """The network as one that chooses, if the task has choices and the network tells its outputs
     apart. It opens a task outside JAX."""
-    if not env.choices or isinstance(network, Choosing) or not tells(network):
+    if not env.choices or isinstance(network, Choosing) or not network.speaks:
         return network
     return Choosing(network, tuple(env.choices), env.masked)
-
-
-def tells(network: AbstractNetwork) -> bool:
-    """Whether its policies tell what they say before their output activation."""
-    n, team = network.least, (2,) * network.team
-
-    def parts():
-        policy = network.init(n, 1, *team, key=jax.random.key(0))
-        obs = jnp.zeros((*team, n))
-        return policy.spoken(obs, policy.start(key=jax.random.key(0)))
-
-    try:
-        jax.eval_shape(parts)
-    except NotImplementedError:
-        return False
-    return True
 
 
 def chosen(policy: AbstractPolicy) -> Choosing:

@@ -66,9 +66,15 @@ class Convolutional(AbstractNetwork):
     def fitted(self, env: Any) -> Self:
         """With the image of a task, where it is not given. It opens a task outside JAX.
 
-        **Raises:** `ValueError` if the task's observations have no image.
+        **Raises:** `ValueError` if the task's observations have no image, or not there.
         """
         if self.shape is not None:
+            if self.start < env.barrable:
+                raise ValueError(
+                    f"start is {self.start}, and the first {env.barrable} numbers of an "
+                    "observation say which actions are allowed: give the place of the image behind "
+                    "them"
+                )
             return self
         if env.image is None:
             raise ValueError(
@@ -100,8 +106,8 @@ class Convolutional(AbstractNetwork):
         return shapes
 
     @property
-    def least(self) -> int:
-        return self.start + math.prod(self.shapes[0])
+    def least(self) -> tuple[int, ...]:
+        return (self.start + math.prod(self.shapes[0]), 1)
 
     def init(self, obs_size: int, action_size: int, *, key: PRNGKeyArray):
         head_key, *keys = jax.random.split(key, 1 + len(self.channels))

@@ -89,6 +89,10 @@ class DMMU(AbstractNetwork):
             )
 
     @property
+    def least(self) -> tuple[int, ...]:
+        return (2, 1, len(self.hidden) if isinstance(self.hidden, tuple) else 2)
+
+    @property
     def remembers(self) -> bool:
         return True
 

@@ -79,8 +79,16 @@ class Team(AbstractNetwork):
         )
 
     @property
-    def least(self) -> int:
-        return 2 if self.trunk else self.head.least
+    def least(self) -> tuple[int, ...]:
+        return (2 if self.trunk else self.head.least[0], 1, len(self.groups) or 2)
+
+    @property
+    def remembers(self) -> bool:
+        return self.head.remembers
+
+    @property
+    def speaks(self) -> bool:
+        return self.head.speaks
 
     def fitted(self, env: Any) -> Self:
         groups = env.groups if self.sharing == "groups" and not self.groups else self.groups
@@ -221,8 +229,8 @@ class Centralized(AbstractNetwork):
     network: AbstractNetwork = MLP(hidden=(300,))  # the network that acts for all agents
 
     @property
-    def least(self) -> int:
-        return self.network.least
+    def least(self) -> tuple[int, ...]:
+        return (*self.network.least[:2], 2)
 
     def init(
         self, obs_size: int, action_size: int, agents: int = 1, *, key: PRNGKeyArray

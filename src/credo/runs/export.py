@@ -118,6 +118,7 @@ def _describe(run: Run, network: dict[str, Any]) -> dict[str, Any]:
         "agents": task["agents"],
         "action": task["actions"],
         "observations": task.get("observations"),
+        "shown": task.get("shown"),
         "names": task.get("names"),
         "choices": task.get("choices") or (),
         "masked": task.get("masked", False),
