@@ -6,11 +6,14 @@ import math
 from collections.abc import Iterable
 from typing import Any, Literal, get_args, get_origin
 
+FEW = 12  # names that are read faster than one that was meant is looked for
+
 
 def choice(name: str, value: str, allowed: Iterable[str]) -> None:
     """Raise unless `value` is one of `allowed`."""
-    if value not in allowed:
-        raise ValueError(f"{name} is {value!r}: it must be one of {', '.join(sorted(allowed))}")
+    if value not in (allowed := sorted(allowed)):
+        meant = suggestion(str(value), allowed) if len(allowed) > FEW else ""
+        raise ValueError(f"{name} is {value!r}{meant}: it must be one of {', '.join(allowed)}")
 
 
 def literals(config: Any) -> None:

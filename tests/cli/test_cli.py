@@ -656,6 +656,16 @@ def test_check_tells_how_often_the_rewards_of_a_team_agree(credo):
     assert 0 <= float(told["local"].split()[0]) <= 1
 
 
+def test_what_a_short_budget_leaves_out_is_said(credo, tmp_path):
+    """A learner that is tested once, and a population that plays more than it was given."""
+    words = "train dqn CartPole-v1 --frames 300 --start-frames 100 --in-process True"
+    err = credo(f"{words} --path {tmp_path / 'dqn'}")[2]
+    assert "tests come every 5,000 frames: a run of 300 has one" in err
+    assert "give --test-every 60" in err
+    words = "train neuroevolution CartPole-v1 --population-size 20 --in-process True --frames 300"
+    assert "so this run may have one generation only" in credo(f"{words} --path {tmp_path}/e")[2]
+
+
 def test_the_best_policy_can_be_asked_for(credo, run, tmp_path):
     for flag, name in (("", "champion"), ("--best", "best")):
         assert credo(f"evaluate {run} --episodes 20 {flag}")[0] == 0
@@ -923,7 +933,10 @@ def test_networks_with_memory_are_trained_go_on_and_are_exported(credo, tmp_path
     assert run.algorithm.env.obs_size == 2
     assert credo(f"resume {path} --frames 840")[0] == 0
     assert credo(f"evaluate {path} --episodes 1")[0] == 0
-    assert credo(f"export {path} {tmp_path / 'policy.npz'}")[0] == 0
+    code, _, err = credo(f"export {path} {tmp_path / 'policy.npz'}")
+    assert code != 0
+    assert "ends in .npz, and a policy is written as .safetensors" in err
+    assert credo(f"export {path} {tmp_path / 'policy.safetensors'}")[0] == 0
 
 
 def test_the_last_reward_is_told_as_it_is_paid(credo, tmp_path):

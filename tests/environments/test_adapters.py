@@ -4,6 +4,7 @@ import dataclasses
 import re
 import warnings
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
@@ -216,3 +217,26 @@ def test_a_delayed_task_is_described_as_the_task_itself():
     hard = delayed(env)
     assert (hard.obs_dtype, hard.task_record()) == ("uint8", env.task_record())
     assert [x.tolist() for x in hard.obs_range] == [[0, 0], [255, 255]]
+
+
+class Timed(gymnasium.Env):
+    """It says itself after how many steps it is over."""
+
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+    def __init__(self, max_episode_steps=7):
+        self.max_episode_steps = max_episode_steps
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+def test_an_environment_may_name_its_own_limit():
+    env = Timed()
+    single = Single(env, {"max_episode_steps": None})
+    assert (single.max_steps, single.warnings) == (7, [])
+    assert Single(env, {"max_episode_steps": 5}).max_steps == 5
+    assert Single(Timed("soon"), {"max_episode_steps": None}).max_steps == 1000

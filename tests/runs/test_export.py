@@ -29,7 +29,7 @@ from credo.networks.recurrent import Recurrent
 from credo.networks.team import Centralized, Team
 from credo.runner import DESCRIPTION, VERSION, Runner
 from credo.runs import checkpoint, config, files
-from credo.runs.export import export, parts_of
+from credo.runs.export import _task, export, parts_of
 from credo.runs.policy import Policy
 from credo.runs.record import RunError
 from credo.runs.store import Run
@@ -358,3 +358,11 @@ def test_a_folder_that_is_not_there_is_not_made(tmp_path):
     with pytest.raises(RunError, match=r"nowhere is no folder: make it first"):
         export(run, tmp_path / "nowhere" / "policy.safetensors")
     assert not (tmp_path / "nowhere").exists()
+
+
+def test_a_task_of_a_package_is_called_by_both():
+    of = lambda name, **more: {"class": f"credo.environments.{name}"} | more  # noqa: E731
+    assert _task(of("brax:Brax", id="hopper", backend="spring")) == "brax:hopper"
+    assert _task(of("gymnasium:Gymnasium", id="Hopper-v5")) == "Hopper-v5"
+    assert _task(of("rover:Rover")) == "Rover"
+    assert _task({"class": "mine.brax:Mine", "id": "x"}) == "x"

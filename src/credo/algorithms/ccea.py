@@ -129,6 +129,11 @@ class CCEA(eqx.Module):
         """z: of each team; of an individual without partners what its φ teams would have."""
         return self.episodes * (self.teams if self.agents == 1 else 1)
 
+    @property
+    def most_frames(self) -> int:
+        """Frames of one generation, if every episode lasts until the time limit."""
+        return self.population_size * self.teams * self.episodes * self.env.max_steps
+
     @float32()
     def init(self, *, key: PRNGKeyArray) -> CCEAState:
         """1: Initialize M populations of k neural network policies."""

@@ -134,6 +134,11 @@ class NEAT(eqx.Module):
         """What all genomes have in common."""
         return Form.of(self.network, self.env.obs_size, self.env.action_size)
 
+    @property
+    def most_frames(self) -> int:
+        """Frames of one generation, if every episode lasts until the time limit."""
+        return self.population_size * self.episodes * self.env.max_steps
+
     @float32()
     def init(self, *, key: PRNGKeyArray) -> NEATState:
         """A population without hidden units."""

@@ -181,6 +181,11 @@ class Neuroevolution(eqx.Module):
         """Members that are kept unchanged: e = int(ψ·k)."""
         return self.breeder.elites(self.population_size)
 
+    @property
+    def most_frames(self) -> int:
+        """Frames of one generation, if every episode lasts until the time limit."""
+        return self.population_size * self.episodes * self.env.max_steps
+
     @float32()
     def init(self, *, key: PRNGKeyArray) -> NeuroevolutionState:
         """1: Initialize a population of k neural networks."""

@@ -83,8 +83,10 @@ class Single:
         self._masks: dict[int, np.ndarray] = {}  # by copy: which options it allows next
 
     def _limit(self, env: gymnasium.Env, limit: int | None) -> int:
-        """Steps of an episode: the least of the user's limit and of every `TimeLimit` wrapper."""
-        limits = [limit]
+        """Steps of an episode: the least of the user's limit, of every `TimeLimit` wrapper, and of
+        what the environment itself has as `max_episode_steps`."""
+        own = getattr(env.unwrapped, "max_episode_steps", None)
+        limits = [limit, own if isinstance(own, int) else None]
         while isinstance(env, gymnasium.Wrapper):
             if isinstance(env, gymnasium.wrappers.TimeLimit):
                 limits.append(env._max_episode_steps)

@@ -16,7 +16,7 @@ from . import bodies, others
 from .makers import hear_mujoco
 
 if importlib.util.find_spec("brax") is None:
-    raise ModuleNotFoundError("tasks of Brax need it: `pip install brax`")
+    raise ModuleNotFoundError("tasks of Brax need it: `pip install 'credo[brax]'`")
 
 with others.importing():
     from brax import envs  # pyright: ignore[reportMissingImports]

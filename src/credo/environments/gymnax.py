@@ -31,11 +31,15 @@ def _old() -> str | None:
 
 
 if importlib.util.find_spec("gymnax") is None:
-    raise ModuleNotFoundError("tasks of gymnax need it: `pip install gymnax`")
+    raise ModuleNotFoundError(
+        "tasks of gymnax need it, and a Gymnasium below 1.4: `pip install gymnax six` in an "
+        "environment of their own"
+    )
 
 if version := _old():
     raise ModuleNotFoundError(
-        f"tasks of gymnax need 1.0 or later, and {version} is installed: `pip install -U gymnax`"
+        f"tasks of gymnax need 1.0 or later, and {version} is installed, which JaxMARL wants: "
+        "make an environment of their own, with `pip install gymnax six`"
     )
 
 try:

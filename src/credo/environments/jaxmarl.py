@@ -21,20 +21,20 @@ from ..types import TimeStep
 from . import others
 
 if importlib.util.find_spec("jaxmarl") is None:
-    raise ModuleNotFoundError("teams of JaxMARL need it: `pip install jaxmarl`")
+    raise ModuleNotFoundError("teams of JaxMARL need it: `pip install 'credo[jaxmarl]'`")
 
 with others.importing():
     import jaxmarl  # pyright: ignore[reportMissingImports]
-    from jaxmarl.environments import (  # pyright: ignore[reportMissingImports]
-        overcooked_layouts,
-        smax,
+    from jaxmarl.environments import overcooked_layouts  # pyright: ignore[reportMissingImports]
+    from jaxmarl.environments.smax.smax_env import (  # pyright: ignore[reportMissingImports]
+        MAP_NAME_TO_SCENARIO,
     )
     from jaxmarl.environments.spaces import Box, Discrete  # pyright: ignore[reportMissingImports]
 
 NAMED = {  # settings that are objects, which a word may stand for
-    ("HeuristicEnemySMAX", "scenario"): smax.map_name_to_scenario,
-    ("SMAX", "scenario"): smax.map_name_to_scenario,
-    ("overcooked", "layout"): overcooked_layouts.__getitem__,
+    ("HeuristicEnemySMAX", "scenario"): MAP_NAME_TO_SCENARIO,
+    ("SMAX", "scenario"): MAP_NAME_TO_SCENARIO,
+    ("overcooked", "layout"): overcooked_layouts,
 }
 
 
@@ -52,16 +52,20 @@ class _Made(NamedTuple):
 @functools.cache
 def _made(id: str, settings: tuple[tuple[str, Any], ...]) -> _Made:
     """An environment by its name. `ValueError` of settings and actions that it cannot have here."""
-    words = {name: NAMED.get((id, name), lambda x: x) for name, _ in settings}
+    given = {name: _meant(id, name, x) for name, x in settings}
     try:
         with others.making():
-            given = {name: words[name](x) if isinstance(x, str) else x for name, x in settings}
             env = jaxmarl.make(id, **given)
             if getattr(env, "auto_reset", False):  # those of Brax
                 env = jaxmarl.make(id, **(given | {"auto_reset": False}))
         with others.permissive():
             spaces: list[Any] = [env.action_space(name) for name in env.agents]
             obs, state = jax.eval_shape(env.reset, jax.random.key(0))
+            if not all(name in obs for name in env.agents):
+                raise ValueError(
+                    f"{id} does not tell observations by agent, which a policy needs: train "
+                    "another team"
+                )
             seen = [jax.eval_shape(others.flat, obs[name]).size for name in env.agents]
             masks = _masks(env, spaces, state)
     except (AssertionError, IndexError, KeyError, TypeError) as error:
@@ -78,6 +82,15 @@ def _made(id: str, settings: tuple[tuple[str, Any], ...]) -> _Made:
     kinds = list(zip(seen, map(int, acts), strict=True))
     groups = tuple(list(dict.fromkeys(kinds)).index(kind) for kind in kinds)
     return _Made(env, spaces, masks, clock, form, groups)
+
+
+def _meant(id: str, name: str, x: Any) -> Any:
+    """What a word of a setting stands for. `ValueError` of one that stands for nothing."""
+    known = NAMED.get((id, name))
+    if known is None or not isinstance(x, str):
+        return x
+    require.choice(name, x, known)
+    return known[x]
 
 
 def _masks(env: Any, spaces: list[Any], state: Any) -> Any:

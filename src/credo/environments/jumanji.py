@@ -23,7 +23,7 @@ from ..types import TimeStep
 from . import others
 
 if importlib.util.find_spec("jumanji") is None:
-    raise ModuleNotFoundError("tasks of Jumanji need it: `pip install jumanji`")
+    raise ModuleNotFoundError("tasks of Jumanji need it: `pip install 'credo[jumanji]'`")
 
 with others.importing():
     import jumanji  # pyright: ignore[reportMissingImports]

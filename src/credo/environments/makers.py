@@ -18,7 +18,8 @@ from .names import Fault
 MOST_STEPS = 1000  # of an episode, where neither the task nor its user names a limit
 NO_LIMIT = (
     f"it names no time limit: an episode is truncated after {MOST_STEPS:,} steps; set "
-    "max_episode_steps, on the command line --max-episode-steps 1000, say"
+    "max_episode_steps, on the command line --max-episode-steps 1000, say, or as an attribute of "
+    "the environment"
 )
 LASTING = {
     "NormalizeObservation": "set normalize_observations of the algorithm, which keeps the "

@@ -25,7 +25,7 @@ from .base import AbstractEnvironment
 from .foreign import AbstractForeignEnvironment
 
 if importlib.util.find_spec("pettingzoo") is None:
-    raise ModuleNotFoundError("teams of others need PettingZoo: `pip install pettingzoo`")
+    raise ModuleNotFoundError("teams of others need PettingZoo: `pip install 'credo[pettingzoo]'`")
 
 from pettingzoo import ParallelEnv
 

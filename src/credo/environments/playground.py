@@ -18,7 +18,9 @@ from . import bodies, others
 from .makers import hear_mujoco
 
 if importlib.util.find_spec("mujoco_playground") is None:
-    raise ModuleNotFoundError("tasks of MuJoCo Playground need it: `pip install playground`")
+    raise ModuleNotFoundError(
+        "tasks of MuJoCo Playground need it: `pip install 'credo[playground]'`"
+    )
 
 with others.importing():
     from mujoco_playground import registry  # pyright: ignore[reportMissingImports]

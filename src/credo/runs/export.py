@@ -16,6 +16,9 @@ from .record import RunError
 from .store import Run
 
 Weights = dict[str, np.ndarray]
+SUFFIX = ".safetensors"
+PACKAGES = ("brax", "gymnax", "jaxmarl", "jumanji", "playground")
+"""Modules of tasks whose ids are those of a package: such a task is called package:id."""
 
 
 def export(run: Run, path: str | pathlib.Path) -> pathlib.Path:
@@ -29,6 +32,11 @@ def export(run: Run, path: str | pathlib.Path) -> pathlib.Path:
     **Raises:** `RunError` if the network is none of Credo's, or the folder is not there.
     """
     path = pathlib.Path(path)
+    if path.suffix not in ("", SUFFIX):
+        raise RunError(
+            f"{path} ends in {path.suffix}, and a policy is written as {SUFFIX}, or as .onnx by "
+            "`credo export`: name it so"
+        )
     if not path.parent.is_dir():
         raise RunError(f"{path.parent} is no folder: make it first, or name another file")
     told, weights = described(run)
@@ -102,6 +110,16 @@ KINDS: dict[str, tuple[str, Any, Any]] = {
 """Of each policy its network's name for the runner, its own weights, and the policies within."""
 
 
+def _task(env: dict[str, Any]) -> str:
+    """What a task is called: its id, that of a package in JAX with the package, or its class."""
+    module, _, name = env["class"].partition(":")
+    package = module.rpartition(".")[2]
+    if "id" not in env:
+        return name
+    known = module.startswith("credo.") and package in PACKAGES
+    return f"{package}:{env['id']}" if known else env["id"]
+
+
 def _describe(run: Run, network: dict[str, Any]) -> dict[str, Any]:
     """What the runner must know, from the record of the run alone: sizes, actions, names of
     agents."""
@@ -111,7 +129,7 @@ def _describe(run: Run, network: dict[str, Any]) -> dict[str, Any]:
     return {
         "version": VERSION,
         "credo": importlib.metadata.version("credo"),
-        "task": env.get("id") or env["class"].partition(":")[2],
+        "task": _task(env),
         "network": network,
         "obs_size": task["obs_size"],
         "action_size": task["action_size"],

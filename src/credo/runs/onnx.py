@@ -6,10 +6,14 @@ have, under `credo.policy`, what the runner's files say of the task and its acti
 under `credo.memory` the memories at the start of an episode.
 """
 
+import contextlib
 import importlib
 import importlib.util
+import io
 import json
+import logging
 import pathlib
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -75,18 +79,30 @@ def _graph(step: Any, obs: np.ndarray, memories: list[Any]) -> Any:
     """The function as an ONNX model."""
     n = range(len(memories))
     try:
-        return importlib.import_module("jax2onnx").to_onnx(
-            step,
-            [jax.ShapeDtypeStruct(x.shape, np.float32) for x in (obs, *memories)],
-            model_name="policy",
-            input_names=["observation", *(f"memory_{i}" for i in n)],
-            output_names=["action", *(f"next_memory_{i}" for i in n)],
-        )
+        with _unheard():
+            return importlib.import_module("jax2onnx").to_onnx(
+                step,
+                [jax.ShapeDtypeStruct(x.shape, np.float32) for x in (obs, *memories)],
+                model_name="policy",
+                input_names=["observation", *(f"memory_{i}" for i in n)],
+                output_names=["action", *(f"next_memory_{i}" for i in n)],
+            )
     except Exception as error:  # whatever a converter of others makes of a network
         raise RunError(
             f"jax2onnx cannot tell this policy as a graph ({type(error).__name__}: {error}): "
             "export it for credo.Runner"
         ) from error
+
+
+@contextlib.contextmanager
+def _unheard() -> Iterator[None]:
+    """jax2onnx prints and logs, with tracebacks, which of its parts this JAX has no use for."""
+    logging.disable(logging.ERROR)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            yield
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def _compare(data: bytes, step: Any, obs: np.ndarray, memories: list[PyTree]) -> None:
