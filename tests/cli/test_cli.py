@@ -1115,6 +1115,7 @@ def test_list_shows_what_teams_need(credo):
     [
         ("train sac rover", "Rover has 6 agents: SAC cannot learn that. Teams learn by TD3"),
         ("train neuroevolution Pendulum-v1 --network dmmu", "DMMU acts for a team and Pendulum-v1"),
+        ("train CartPole-v1 dqn", "the algorithm comes first: credo train dqn CartPole-v1"),
         ("train matd3 Pendulum-v1", "trains teams and Pendulum-v1 has one agent"),
         ("train matd3 Pendulum-v1 --network mlp", "one agent"),
         ("train merl Pendulum-v1", "trains teams and Pendulum-v1 has one agent"),

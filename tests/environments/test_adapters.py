@@ -240,3 +240,13 @@ def test_an_environment_may_name_its_own_limit():
     assert (single.max_steps, single.warnings) == (7, [])
     assert Single(env, {"max_episode_steps": 5}).max_steps == 5
     assert Single(Timed("soon"), {"max_episode_steps": None}).max_steps == 1000
+
+
+def test_a_mask_of_what_is_no_choice_is_warned_of():
+    class Pushed(Timed):
+        observation_space = gymnasium.spaces.Dict(
+            {"action_mask": gymnasium.spaces.MultiBinary(2), "x": Timed.observation_space}
+        )
+
+    (told,) = Single(Pushed(), {"max_episode_steps": 5}).warnings
+    assert "an action_mask of shape (2,) and 0 options to choose from" in told

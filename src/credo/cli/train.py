@@ -78,6 +78,8 @@ class Train:
     def __call__(self, line: Line) -> None:
         """Train, or show or write the settings; without a task or algorithm, say what is missing.
         A task that is not ours is checked first."""
+        if self.algorithm not in ALGORITHMS and self.task in ALGORITHMS:
+            fail(f"the algorithm comes first: credo train {self.task} {self.algorithm}")
         if self.algorithm and self.algorithm not in ALGORITHMS:
             fail(f"no algorithm {self.algorithm!r}", self.algorithm, ALGORITHMS)
         if not (self.task or (line.help and self.algorithm)):

@@ -71,6 +71,11 @@ class Single:
         self.actions = described(env.action_space)
         self._options, seen = sum(acts.choices), shown_mask(env.observation_space)
         self._seen = seen is not None and seen.shape == (self._options,)
+        if seen is not None and not self._seen:
+            self.warnings.append(
+                f"it has an action_mask of shape {seen.shape} and {self._options} options to "
+                "choose from: that mask is told as any other numbers, and not followed"
+            )
         self.masked = bool(acts.choices) and (self._seen or _masks(env))
         flat = as_flat(env.observation_space, first="action_mask" if self._seen else None)
         if self.masked and not self._seen:
