@@ -17,6 +17,7 @@ import sys
 
 import credo
 
+FILES = ["README.md", "policy.safetensors"]
 CARD = """---
 library_name: credo
 license: {license}
@@ -45,8 +46,10 @@ SHA-256 of policy.safetensors: `{digest}`
 
 
 def prepare(run: pathlib.Path, folder: pathlib.Path, license: str, upload: str) -> None:
-    """Write a run's champion and its card, README.md, into a folder."""
+    """Write a run's champion and its card, README.md, into a folder that has nothing else."""
     folder.mkdir(parents=True, exist_ok=True)
+    if others := [path.name for path in folder.iterdir() if path.name not in FILES]:
+        raise SystemExit(f"{folder} has other files, such as {others[0]}: name a folder of its own")
     loaded, policy = credo.Run(run), folder / "policy.safetensors"
     credo.export(loaded, policy)
     told = credo.Runner.load(policy).description
@@ -72,11 +75,12 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=pathlib.Path)
     parser.add_argument("--license", default="apache-2.0")
     parser.add_argument("--upload", metavar="OWNER/NAME")
+    parser.add_argument("--public", action="store_true", help="everybody may see what is uploaded")
     args = parser.parse_args()
     prepare(args.run, args.folder, args.license, args.upload or "OWNER/NAME")
     if args.upload:
         from huggingface_hub import HfApi
 
         hub = HfApi()
-        hub.create_repo(args.upload, exist_ok=True)
-        print(hub.upload_folder(repo_id=args.upload, folder_path=args.folder))
+        hub.create_repo(args.upload, exist_ok=True, private=not args.public)
+        print(hub.upload_folder(repo_id=args.upload, folder_path=args.folder, allow_patterns=FILES))

@@ -6,6 +6,7 @@ Claims are in `docs/results/claims.toml`, whose head says what a part may hold. 
 written by hand: it follows from the committed rows by the rule that the page states.
 """
 
+import functools
 import itertools
 import json
 import pathlib
@@ -17,12 +18,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.stats
 
-from credo.analysis.statistics import (
-    bootstrap_interval,
-    improvement_interval,
-    probability_of_improvement,
-)
+from credo.analysis.statistics import bootstrap_interval, probability_of_improvement
+from credo.experiments import base
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 RESULTS, PAGE = ROOT / "results", ROOT / "docs" / "results" / "claims.md"
@@ -30,6 +29,8 @@ SOURCE, README = PAGE.with_suffix(".toml"), ROOT / "README.md"
 BEGIN, END = "<!-- claims: python docs/extensions/claims.py -->\n", "<!-- end of claims -->\n"
 BUDGETS = ("published", "million", "full", "quick")  # the largest first
 FEWEST = 3  # seeds of a cell that decides
+ENOUGH = 5  # seeds by which a difference that is not seen counts as none
+LEVEL = 0.05  # of the rank test
 NEVER = 1e30  # in place of None, where a run did not get there
 VERDICTS = ("reproduced", "in part", "not reproduced", "refuted", "open")
 REDUCE = {"mean": np.mean, "max": np.max, "min": np.min, "count": len}
@@ -43,6 +44,7 @@ class Found(NamedTuple):
     text: str
     seeds: int = 0
     path: pathlib.Path | None = None
+    share: float = 1.0  # of the published budget
 
 
 def claims() -> list[dict[str, Any]]:
@@ -101,6 +103,9 @@ def values(
         return picked
     pooled = (*PLAIN, *part.get("pool", ()))
     runs: dict[Any, list[float]] = {}
+    if part.get("reduce") == "count":  # a run may have none
+        seeds = next(x for x in found["cells"] if x["labels"].items() <= wanted.items())["seeds"]
+        runs = {seed: [] for seed in seeds}
     for row in found["rows"]:
         told = dict(zip(columns, row, strict=True))
         seed, metric, value = (told.pop(name) for name in ("seed", "metric", "value"))
@@ -125,18 +130,53 @@ def found(part: Mapping[str, Any]) -> Found:
     if committed is None or second is None:
         return Found("open", f"{part['of']}: no data".removeprefix(": "))
     path, data = committed
-    mine = values(data, part, cell)
+    mine, had = values(data, part, cell), share(part["experiment"], data, cell)
     if not mine.size:
         raise ValueError(f"{part}: no row of {path} fits")
-    theirs = None if other is None else values(second[1], part, other)
-    if theirs is None or "relative" in part:
-        verdict, text, seeds = level(mine if theirs is None else mine / theirs.mean(), part)
+    if other is None or "relative" in part:
+        base = 1.0 if other is None else values(second[1], part, other).mean()
+        verdict, text, seeds = level(mine / base, part)
+        # What was reached in less time is reached; that something fails takes all of it.
+        whole = had >= 1.0 or (verdict == "reproduced" and not fails(part))
     else:
+        theirs = values(second[1], part, other)
         verdict, text, seeds = comparison(mine, theirs, part.get("less", False), scale(part))
-    few = seeds < FEWEST and not part.get("single", False)
-    if few or (part.get("short", False) and verdict != "reproduced"):
+        loser = share(part.get("than", part["experiment"]), second[1], other)
+        whole = had >= 1.0 if verdict != "reproduced" else loser >= had
+        had = min(had, loser)
+    exact = part.get("single", False)
+    if not exact and (not whole or seeds < FEWEST):
         verdict = "open"
-    return Found(verdict, f"{part['of']}: {text}".removeprefix(": "), seeds, path)
+    had = 1.0 if exact else had
+    return Found(verdict, f"{part['of']}: {text}".removeprefix(": "), seeds, path, had)
+
+
+def fails(part: Mapping[str, Any]) -> bool:
+    """Whether it is claimed that something does not get far, rather than that it does."""
+    return "at_most" in part and not part.get("low", False)
+
+
+@functools.cache
+def planned(experiment: str) -> list[Any]:
+    """The cells of an experiment, at every budget that it has."""
+    made = base.find(experiment)
+    return [cell for budget in made.budgets for cell in made.cells(budget)]
+
+
+def share(experiment: str, data: Mapping[str, Any], cell: Mapping[str, Any]) -> float:
+    """How much of its largest planned budget, the published one where there is one, a committed
+    cell had, at most 1: in generations or frames, and in updates for each frame."""
+    wanted = labels_of(data, cell) or {}
+    here = next(x for x in data["cells"] if x["labels"].items() <= wanted.items())
+    every = [x for x in planned(experiment) if x.labels == here["labels"]]
+    shares = [1.0]
+    for limit, n in here["budget"].items():
+        most = max((x.budget.get(limit) or 0 for x in every), default=0)
+        if limit in ("generations", "frames") and most:
+            shares.append(n / most)
+    updates = here.get("algorithm", {}).get("updates_per_frame")
+    most = max((getattr(x.algorithm, "updates_per_frame", 0) for x in every), default=0)
+    return min(shares) * (min(updates / most, 1.0) if updates and most else 1.0)
 
 
 def scale(part: Mapping[str, Any]) -> float:
@@ -145,58 +185,62 @@ def scale(part: Mapping[str, Any]) -> float:
 
 def level(x: np.ndarray, part: Mapping[str, Any]) -> tuple[str, str, int]:
     """A number against one that it must reach, or must not pass."""
-    factor, n = scale(part), len(x)
+    factor, n, low_is_good = scale(part), len(x), "at_most" in part
     if part.get("best", False):
-        x = x[[np.argmin(x) if "at_most" in part else np.argmax(x)]]
+        x = x[[np.argmin(x) if low_is_good else np.argmax(x)]]
+    if (x >= NEVER).any():  # some runs did not get there: what counts is how many did
+        there = int((x <= part["at_most"]).sum())
+        verdict = "reproduced" if there == n else "in part" if there else "not reproduced"
+        return verdict, "; ".join(_one(y, factor) for y in x), n
     mean = float(np.mean(x))
     low, high = (float(y) for y in bootstrap_interval(x)) if len(x) > 1 else (mean, mean)
     if np.isnan(low):  # of values that are all alike there is no other
         low = high = mean
+    text = _shown(mean, low, high, factor)
     if part.get("positive", False):
-        verdict = (
-            "reproduced"
-            if low > 0.0
-            else "refuted"
-            if high < 0.0
-            else "in part"
-            if mean > 0.0
-            else "not reproduced"
-        )
-        return verdict, _shown(mean, low, high, factor), n
-    if "at_least" in part:
-        goal, error = part["at_least"], part.get("error", 0.0)
-        reached, possible, otherwise = mean >= goal, high >= goal - error, "not reproduced"
+        above, below, against = low > 0.0, high < 0.0, "refuted"
+        return "reproduced" if above else against if below else "not reproduced", text, n
+    if low_is_good:
+        goal, against = part["at_most"], "not reproduced" if part.get("low", False) else "refuted"
+        reached, possible = mean <= goal, low <= goal
     else:
-        goal = part["at_most"]
-        reached, possible, otherwise = mean <= goal, low <= goal, "refuted"
-    verdict = "reproduced" if reached else "in part" if possible else otherwise
-    return verdict, _shown(mean, low, high, factor), n
+        goal, against = part["at_least"] - part.get("error", 0.0), "not reproduced"
+        reached, possible = mean >= goal, high >= goal
+    verdict = "reproduced" if reached else "in part" if possible and n >= ENOUGH else against
+    return verdict, text, n
 
 
 def comparison(x: np.ndarray, y: np.ndarray, less: bool, factor: float) -> tuple[str, str, int]:
     """Whether a run of the first is above one of the second; with `less`, below."""
-    sign = -1.0 if less else 1.0
+    sign, n = -1.0 if less else 1.0, min(len(x), len(y))
     better = probability_of_improvement(sign * x, sign * y)
-    low, high = improvement_interval(sign * x, sign * y)
+    chance, reverse = rank_test(sign * x, sign * y), rank_test(sign * y, sign * x)
     means = " against ".join(_one(float(np.mean(z)), factor) for z in (x, y))
-    text = f"{means}; P {better:.2f} ({low:.2f} to {high:.2f})"
-    if low > 0.5:
-        verdict = "reproduced"
-    elif high < 0.5:
-        verdict = "refuted"
-    else:
-        verdict = "in part" if better > 0.5 else "not reproduced"
-    return verdict, text, min(len(x), len(y))
+    verdict = "reproduced" if chance <= LEVEL else "refuted" if reverse <= LEVEL else ""
+    if not verdict:  # that nothing is seen in a few runs says nothing
+        verdict = "not reproduced" if n >= ENOUGH else "open"
+    text = f"{means}; P {better:.2f}"
+    return verdict, text + (f", p {min(chance, reverse):.2g}" if n > 1 else ""), n
+
+
+def rank_test(x: np.ndarray, y: np.ndarray) -> float:
+    """The probability that runs which do not differ would be told apart as these are, or more: the
+    exact one-sided test of Mann and Whitney, ties sharing their ranks."""
+    ranks = scipy.stats.rankdata(np.concatenate([x, y]))
+    sums = ranks[_choices(len(ranks), len(x))].sum(axis=1)
+    return float(np.mean(sums >= ranks[: len(x)].sum() - 1e-9))
+
+
+@functools.cache
+def _choices(n: int, k: int) -> np.ndarray:
+    """Every choice of k of n."""
+    return np.array(list(itertools.combinations(range(n), k)))
 
 
 def _one(x: float, factor: float) -> str:
-    return (
-        "never"
-        if abs(x) > NEVER / 100
-        else f"{x * factor:.3g}"
-        if abs(x * factor) < 1e3
-        else f"{x * factor:,.0f}"
-    )
+    if x >= NEVER:
+        return "never"
+    return f"{x * factor:.3g}" if abs(x * factor) < 1e3 else f"{x * factor:,.0f}"
 
 
 def _shown(mean: float, low: float, high: float, factor: float) -> str:
@@ -212,7 +256,7 @@ def together(verdicts: list[str]) -> str:
         return verdicts[0]
     if "open" in kinds:
         return "open"
-    if "reproduced" in kinds or "in part" in kinds:
+    if "reproduced" in kinds:
         return "in part"
     return "refuted" if "refuted" in kinds else "not reproduced"
 
@@ -227,8 +271,14 @@ def row(number: int, claim: Mapping[str, Any]) -> tuple[str, str]:
         ours += " %"
     if there and len(there) < len(every):
         ours += f"; {len(every) - len(there)} of {len(every)} without data"
+    if least := [x.share for x in there if x.share < 1.0]:
+        ours += f" *({min(least):.0%} of the published budget)*"
+    if against := [x.text.partition(":")[0] for x in every if x.verdict == "refuted"]:
+        refuted = f", refuted for {', '.join(against)}" if verdict != "refuted" else ""
+    else:
+        refuted = ""
     seeds = sorted({x.seeds for x in there})
-    cost = f", {claim['hours']:g} core-hours" if verdict == "open" else ""
+    cost = f", {claim.get('hours', 0):g} core-hours" if verdict == "open" else ""
     cells = (
         str(number),
         claim["where"],
@@ -236,7 +286,7 @@ def row(number: int, claim: Mapping[str, Any]) -> tuple[str, str]:
         claim["published"],
         ours,
         " to ".join(str(n) for n in dict.fromkeys((seeds[0], seeds[-1]))) if seeds else "",
-        f"**{verdict}**{cost}",
+        f"**{verdict}**{refuted}{cost}",
         ", ".join(links(x.path for x in there) or sources(claim)),
     )
     return "| " + " | ".join(cells) + " |", verdict
@@ -257,14 +307,14 @@ def sources(claim: Mapping[str, Any]) -> list[str]:
 
 
 def table() -> str:
-    """The count, and all claims by chapter."""
+    """The counts, and all claims by chapter."""
     rows: dict[int, list[str]] = {}
-    counted: Counter[str] = Counter()
+    counted: dict[bool, Counter[str]] = {False: Counter(), True: Counter()}
     for number, claim in enumerate(claims(), start=1):
         line, verdict = row(number, claim)
         rows.setdefault(claim["chapter"], []).append(line)
-        counted[verdict] += 1
-    lines = [count(counted), ""]
+        counted[claim.get("ours", False)][verdict] += 1
+    lines = [f"**{count(counted[False])}.** With settings of ours, {count(counted[True])}.", ""]
     for chapter, told in sorted(rows.items()):
         lines += [
             f"## Chapter {chapter}",
@@ -280,7 +330,7 @@ def table() -> str:
 def count(counted: Mapping[str, int]) -> str:
     """How many claims have which verdict, in one line."""
     told = ", ".join(f"{counted[name]} {name}" for name in VERDICTS)
-    return f"**{sum(counted.values())} claims: {told}.**"
+    return f"{sum(counted.values())} claims: {told}"
 
 
 def page() -> tuple[str, str, str]:
@@ -294,6 +344,6 @@ if __name__ == "__main__":
     before, _, after = page()
     written = table()
     PAGE.write_text(before + written + after, "utf-8")
-    told = f"on {written.splitlines()[0].strip('*')}"
+    told = f"on {written[2:].partition('.**')[0]}."
     README.write_text(re.sub(r"on \d+ claims: .*", told, README.read_text("utf-8")), "utf-8")
-    sys.stdout.write(f"{told}\n")
+    sys.stdout.write(written.partition("\n")[0] + "\n")

@@ -27,6 +27,10 @@ LARGEST = 2**30  # bytes of a file
 DEEPEST = 8  # networks within networks
 MOST_AGENTS = 10_000
 MOST_PASSES = 10_000
+UNMASKED = (
+    "this task says which actions are allowed, and neither a mask was given nor does the "
+    "observation begin with it: give mask=, ones where all are allowed"
+)
 
 Weights = dict[str, np.ndarray]
 
@@ -143,7 +147,9 @@ class Units:
             raise ValueError(f"choices are {task['choices']}, more than an action or observation")
         self._lengths = self._one_each("lengths", task.get("lengths"))
         self._discrete = task.get("observations") if agents is None else None
-        self._shown = task.get("shown") if agents is None else None
+        self._shown = self._one_each("shown", task.get("shown") if agents else [task.get("shown")])
+        self._heard = False  # whether what is allowed was said of any agent
+        self._asks = bool(task.get("asks", self.agents is None and self._mask))
         if self._discrete is not None:
             n, start = self._discrete["n"], self._discrete["start"]
             if n != self.obs_size - self._mask or type(start) is not int:
@@ -190,10 +196,13 @@ class Units:
         masks = [None] * self.agents if mask is None else self._one_each("mask", mask)
         rows = np.zeros((self.agents, self.obs_size), np.float32)
         rows[:, : self._mask] = 1.0  # who is not there may do anything
+        self._heard = not self._asks
         for k, row in enumerate(observation):
             if row is not None:
                 row = self._row(row, masks[k], k)
                 rows[k, : row.size] = row
+        if not self._heard and any(row is not None for row in observation):
+            raise ValueError(UNMASKED)
         return rows
 
     def own(self, output: np.ndarray, mask: Any) -> Any:
@@ -209,8 +218,14 @@ class Units:
 
     def _row(self, observation: Any, mask: Any, k: int) -> np.ndarray:
         """The observation of agent k. In a team of others it may be shorter than the largest."""
-        if isinstance(observation, Mapping) or (self._shown and isinstance(observation, tuple)):
-            x = _flat(observation, self._shown)
+        shown = self._shown[k] if self._shown else None
+        if isinstance(observation, Mapping) and self.agents is not None:
+            observation = {**observation}  # what is allowed is told apart in a team
+            mask = observation.pop("action_mask", None) if mask is None else mask
+            if shown is None and len(observation) == 1:
+                (observation,) = observation.values()
+        if isinstance(observation, Mapping) or (shown and _in_parts(observation)):
+            x = _flat(observation, shown)
         elif self._discrete is not None and np.ndim(observation) == 0:
             x = _one_hot(observation, self._discrete["n"], self._discrete["start"])
         else:
@@ -228,15 +243,16 @@ class Units:
         """An observation with what is allowed in front, which it may have already."""
         own = self.obs_size - self._mask if self._lengths is None else self._lengths[k]
         if x.size == own:
-            if mask is None and self.agents is None:
-                raise ValueError(
-                    "this task says which actions are allowed, and neither a mask was given nor "
-                    "does the observation begin with it: give mask=, ones where all are allowed"
-                )
+            if mask is None and self._asks and self.agents is None:
+                raise ValueError(UNMASKED)
+            self._heard |= mask is not None
             options = self._mask if self._own is None else self._own[k][0]
             x = np.append(np.arange(self._mask) < options, x).astype(np.float32)
+        elif x.size in (self.obs_size, own + self._mask):
+            self._heard = True
         if mask is None:
-            if x.size == self.obs_size and not np.isin(x[: self._mask], (0.0, 1.0)).all():
+            in_front = x.size in (self.obs_size, own + self._mask)
+            if in_front and not np.isin(x[: self._mask], (0.0, 1.0)).all():
                 raise ValueError(
                     f"the observation begins with {x[: self._mask]}, and should with what is "
                     "allowed: 0 or 1 for each option, in front of all else, or give mask="
@@ -284,6 +300,13 @@ def _size(what: str, n: Any, most: int | None = None) -> int:
     return n
 
 
+def _in_parts(observation: Any) -> bool:
+    """Whether a sequence is the parts of a Tuple, and not their numbers one after the other."""
+    if isinstance(observation, list):
+        return any(isinstance(x, Mapping | tuple) or np.ndim(x) for x in observation)
+    return isinstance(observation, tuple)
+
+
 def _flags(mask: Any) -> np.ndarray:
     """A mask as one row, also of several choices in a tuple, as Gymnasium samples by them."""
     parts = mask if isinstance(mask, tuple) and any(np.ndim(x) for x in mask) else (mask,)
@@ -299,6 +322,10 @@ def _flat(observation: Any, shown: Any) -> np.ndarray:
         )
     if "parts" in shown:
         rows = []
+        if not isinstance(observation, Mapping) and len(observation) != len(shown["parts"]):
+            raise ValueError(
+                f"the observation has {len(observation)} parts: it must have {len(shown['parts'])}"
+            )
         for key, part in shown["parts"]:
             try:
                 rows.append(_flat(observation[key], part))

@@ -1078,6 +1078,25 @@ def test_agents_of_a_kind_may_share_in_any_algorithm(words, monkeypatch):
     assert network.network.groups == (0, 1)
 
 
+def test_settings_files_of_before_are_read(credo, tmp_path):
+    """They name what is within a network that chooses by both, and what follows from the task."""
+    file = tmp_path / "old.toml"
+    file.write_text(
+        '"algorithm" = "dqn"\n"task" = "CartPole-v1"\n"network.network.hidden" = [32]\n'
+        '"network.choices" = [2]\n"network.masked" = false\n"in-process" = true\n'
+    )
+    code, out, err = credo(f"train --config {file} --print-config")
+    assert code == 0, err
+    assert '"network.hidden" = [32]' in out
+    assert "--network.network" in credo("train dqn CartPole-v1 --network.network.hidden 3")[2]
+
+
+def test_units_of_a_centralized_network_have_a_short_name():
+    line = Line("train", ["neuroevolution", "rover", "--network", "cnf", "--hidden", "32"])
+    network = train.algorithm_of(line, line.command(train.Train)).network
+    assert network.network.hidden == (32,)
+
+
 def test_cerl_trains_a_team(monkeypatch):
     pytest.importorskip("pettingzoo")
     monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parents[1] / "environments"))

@@ -197,6 +197,7 @@ def test_a_task_says_how_it_takes_actions():
         "actions": {"n": 3, "start": 5},
         "observations": None,
         "shown": None,
+        "asks": False,
         "names": None,
     }
     numbered = here("Numbered").task_record()
@@ -239,7 +240,11 @@ def test_an_environment_may_name_its_own_limit():
     single = Single(env, {"max_episode_steps": None})
     assert (single.max_steps, single.warnings) == (7, [])
     assert Single(env, {"max_episode_steps": 5}).max_steps == 5
-    assert Single(Timed("soon"), {"max_episode_steps": None}).max_steps == 1000
+    assert Single(Timed(np.int64(7)), {"max_episode_steps": None}).max_steps == 7
+    for none in ("soon", -1, 0, True, None):
+        single = Single(Timed(none), {"max_episode_steps": None})
+        assert single.max_steps == 1000
+        assert "names no time limit" in single.warnings[0]
 
 
 def test_a_mask_of_what_is_no_choice_is_warned_of():

@@ -243,9 +243,8 @@ def test_a_mask_may_stand_before_the_observation_of_any_agent():
     given = [[0, 1, 1, 0.5, 0.6], [0, 1, 0, 0.5]]
     read = units.read(given)
     np.testing.assert_allclose(read, [[0, 1, 1, 0.5, 0.6], [0, 1, 0, 0.5, 0]])
-    np.testing.assert_allclose(
-        units.read([[0.5, 0.6], [0.5]]), [[1, 1, 1, 0.5, 0.6], [1, 1, 0, 0.5, 0]]
-    )
+    read = units.read([[0.5, 0.6], given[1]])
+    np.testing.assert_allclose(read, [[1, 1, 1, 0.5, 0.6], [0, 1, 0, 0.5, 0]])
 
 
 def test_a_policy_takes_a_dict_as_the_task_gives_it():
@@ -263,6 +262,12 @@ def test_a_policy_takes_a_dict_as_the_task_gives_it():
     sizes = {"obs_size": 7, "action_size": 1, "shown": shown}
     read = Units(sizes).read({"y": 1, "x": np.array([1, 3]), "more": "text"})
     np.testing.assert_array_equal(read, [0, 1, 0, 0, 1, 0, 1])
+    for parts in ((np.array([1, 3]), 1), [np.array([1, 3]), 1]):
+        pairs = {"parts": [[0, shown["parts"][0][1]], [1, shown["parts"][1][1]]]}
+        np.testing.assert_array_equal(Units(sizes | {"shown": pairs}).read(parts), read)
+    with pytest.raises(ValueError, match="has 3 parts: it must have 2"):
+        Units(sizes | {"shown": pairs}).read((np.array([1, 3]), 1, 1))
+    np.testing.assert_array_equal(Units(sizes).read(read.tolist()), read)  # its numbers alone
     with pytest.raises(ValueError, match="is a dict, of which the policy's record does not tell"):
         Units(sizes | {"shown": None}).read({"x": 1})
 
@@ -279,6 +284,25 @@ def test_masks_of_several_choices_may_come_in_a_tuple():
     units = Units(task("Several", split=True).task_record())
     read = units.read([0.0], (np.array([0, 1, 1]), np.array([1, 0])))
     np.testing.assert_array_equal(read, [0, 1, 1, 1, 0, 0])
+
+
+@pytest.mark.parametrize("where", ["obs", "info", "nowhere"])
+def test_a_team_is_not_played_without_the_masks_that_its_task_gives(where):
+    env = task("Team", PettingZoo, where=where)
+    units, given = Units(env.task_record()), [[0.5, 0.6], [0.5]]
+    if where == "nowhere":  # one agent has an action less: that is all
+        np.testing.assert_allclose(units.read(given)[:, :3], [[1, 1, 1], [1, 1, 0]])
+        return
+    with pytest.raises(ValueError, match="neither a mask was given nor does the observation"):
+        units.read(given)
+    np.testing.assert_allclose(units.read(given, [[0, 1, 1], None])[:, :3], [[0, 1, 1], [1, 1, 0]])
+    dicts = {
+        "a": {"observation": np.array([0.5, 0.6]), "action_mask": np.array([0, 1, 1])},
+        "b": {"action_mask": np.array([0, 1]), "observation": np.array([0.5])},
+    }
+    np.testing.assert_allclose(units.read(dicts), [[0, 1, 1, 0.5, 0.6], [0, 1, 0, 0.5, 0]])
+    with pytest.raises(ValueError, match=r"begins with \[0.5"):
+        units.read([[0.5, 0.6, 1, 1, 0], None])
 
 
 def test_a_network_that_groups_share_is_looked_at_before_groups_are_known():

@@ -54,15 +54,15 @@ def test_sizes_and_the_clock():
     env = Playground("CheetahRun")
     assert (env.sizes, env.discrete, env.max_steps) == ((17, 6), False, 1000)
     short = Playground("CartpoleBalance", kwargs={"episode_length": 11, "action_repeat": 2})
-    assert short.max_steps == 5
+    assert short.max_steps == 6
     state, now = short.reset(key=KEY)
     step = jax.jit(lambda state: short.step(state, jnp.zeros(1), key=KEY))
     ends = []
-    for _ in range(5):
+    for _ in range(6):
         assert not bool(now.truncated)
         state, now = step(state)
         ends.append((bool(now.terminated), bool(now.truncated)))
-    assert ends == [(False, False)] * 4 + [(False, True)]
+    assert ends == [(False, False)] * 5 + [(False, True)]
 
 
 def test_our_check_finds_nothing():
@@ -77,16 +77,17 @@ def test_a_population_plays_it():
     assert np.all(played.returns["reward"] > 0.0)
 
 
-def test_a_simulation_that_diverges_ends_its_episode_with_numbers():
+@pytest.mark.parametrize("number", [jnp.nan, jnp.inf])
+def test_a_simulation_that_diverges_ends_its_episode_with_numbers(number):
     env = Playground("CartpoleBalance")
     state, _ = env.reset(key=KEY)
     data = state.inner.data
-    broken = data.replace(qvel=jnp.full_like(data.qvel, jnp.nan))
+    broken = data.replace(qvel=jnp.full_like(data.qvel, number))
     state = bodies.BodiesState(state.inner.replace(data=broken), state.step)
     _, now = env.step(state, jnp.zeros(1), key=KEY)
     assert bool(now.terminated)
     assert np.isfinite(now.obs).all()
-    assert np.isfinite(now.rewards["reward"])
+    assert abs(float(now.rewards["reward"])) < 10.0
 
 
 def test_a_policy_sees_the_state_alone_of_several_observations():
@@ -101,6 +102,10 @@ def test_what_playground_does_not_have_is_refused():
         Playground("CheetahRun", kwargs={"sim_dtt": 0.01})
     with pytest.raises(ValueError, match=r"CheetahRun was not made: .*int"):
         Playground("CheetahRun", kwargs={"episode_length": "long"})
+    with pytest.raises(ValueError, match=r"setting is 'impl': it must|setting is 'impl' .did"):
+        Playground("CartpoleBalance", kwargs={"impl": "warp"})  # a field of its own
+    with pytest.raises(ValueError, match=r"action_repeat is 0: it must be at least 1"):
+        Playground("CartpoleBalance", kwargs={"action_repeat": 0})
     with pytest.raises(ValueError, match=r"impl is 'cpp'"):
         Playground("CheetahRun", impl="cpp")  # pyright: ignore[reportArgumentType]
     if jax.default_backend() != "gpu":

@@ -135,11 +135,22 @@ class Line:
             made = tuple(self.take(one, f"{at}.{i}.") for i, one in enumerate(value))
             return made if any(a is not b for a, b in zip(made, value, strict=True)) else value
         inner: str = getattr(type(value), "flags_of", "")
-        if inner:  # it stands for what is within
+        if inner:  # it stands for what is within; files of before name it as well
+            self._rename(f"{at}.{inner}.", f"{at}.", value, inner)
             new = self.inside(getattr(value, inner), at)
             same = new is getattr(value, inner)
             return value if same else dataclasses.replace(typing.cast(Any, value), **{inner: new})
         return self.take(value, f"{at}.") if dataclasses.is_dataclass(value) else value
+
+    def _rename(self, old: str, new: str, value: Any, inner: str) -> None:
+        """Of a file the names that begin with `old`; what only the object around has is derived."""
+        of = {f.name for f in dataclasses.fields(value)} - {inner}
+        self.used |= {f"{new}{name}" for name in of}
+        if not hasattr(getattr(value, inner), inner):
+            self.filed = [
+                (new + name.removeprefix(old) if name.startswith(old) else name, values)
+                for name, values in self.filed
+            ]
 
     def _given(self, at: str, kind: Any, value: Any, text: str) -> Iterator[list[str]]:
         """The values that were typed for a field: of a file first, short names before full ones."""

@@ -255,7 +255,7 @@ def _note_few(algorithm: Any, options: RunOptions) -> None:
             f"{'one generation' if least == 1 else f'{least} generations'} only: give more --frames"
         )
     often = getattr(algorithm, "test_every", 0)  # of who has no population in frames
-    if options.frames and often and not size and options.frames < 2 * often:
+    if options.frames and often and not size and options.frames < often:
         say(
             f"credo: note: tests come every {often:,} frames: a run of {options.frames:,} has one, "
             f"after its first generation; give --test-every {max(1, options.frames // 5)}, say"

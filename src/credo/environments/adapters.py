@@ -77,6 +77,7 @@ class Single:
                 "choose from: that mask is told as any other numbers, and not followed"
             )
         self.masked = bool(acts.choices) and (self._seen or _masks(env))
+        self.asks = self.masked
         flat = as_flat(env.observation_space, first="action_mask" if self._seen else None)
         if self.masked and not self._seen:
             flat = flat.behind(self._options)
@@ -90,8 +91,9 @@ class Single:
     def _limit(self, env: gymnasium.Env, limit: int | None) -> int:
         """Steps of an episode: the least of the user's limit, of every `TimeLimit` wrapper, and of
         what the environment itself has as `max_episode_steps`."""
-        own = getattr(env.unwrapped, "max_episode_steps", None)
-        limits = [limit, own if isinstance(own, int) else None]
+        own: Any = getattr(env.unwrapped, "max_episode_steps", None)
+        whole = isinstance(own, int | np.integer) and not isinstance(own, bool)
+        limits = [limit, int(own) if whole and own >= 1 else None]
         while isinstance(env, gymnasium.Wrapper):
             if isinstance(env, gymnasium.wrappers.TimeLimit):
                 limits.append(env._max_episode_steps)
@@ -167,7 +169,6 @@ class Team:
 
     observations: ClassVar[None] = None
     image: ClassVar[None] = None
-    shown: ClassVar[None] = None
 
     @staticmethod
     def make(spec: dict[str, Any]) -> Any:
@@ -197,10 +198,13 @@ class Team:
         self._learn_actions(env)
         spaces = [env.observation_space(name) for name in self.names]
         kinds = [(str(space), str(told)) for space, told in zip(spaces, self.actions, strict=True)]
-        self.lengths = [as_flat(without_mask(s) if shown_mask(s) else s).size for s in spaces]
+        parts = [without_mask(s) if shown_mask(s) else s for s in spaces]
+        self.lengths = [as_flat(part).size for part in parts]
         self.groups = [list(dict.fromkeys(kinds)).index(kind) for kind in kinds]
         self._seen = [shown_mask(space) is not None for space in spaces]
-        self.masked = self._uneven or any(self._seen) or (bool(self.choices) and _masks(env))
+        self.asks = bool(self.choices) and (any(self._seen) or _masks(env))
+        self.masked = self._uneven or any(self._seen) or self.asks
+        self.shown = [as_shown(part) for part in parts]
         flats = [self._flat(space, seen) for space, seen in zip(spaces, self._seen, strict=True)]
         self.obs_size = max(flat.size for flat in flats)
         self.obs_dtype = "uint8" if all(x.dtype == "uint8" for x in flats) else "float32"

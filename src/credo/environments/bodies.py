@@ -96,7 +96,7 @@ class AbstractBodies(others.AbstractOther):
         state = BodiesState(inner, state.step + 1)
         obs, reward = _seen(inner.obs), inner.reward.astype(jnp.float32)
         finite = jnp.isfinite(obs).all() & jnp.isfinite(reward)
-        obs, reward = jnp.nan_to_num(obs, posinf=0.0, neginf=0.0), jnp.nan_to_num(reward)
+        obs, reward = (jnp.where(jnp.isfinite(x), x, 0.0) for x in (obs, reward))
         over = (inner.done > 0.5) | ~finite
         now = TimeStep(obs, {"reward": reward}, over, jnp.bool_(False))
         return state, now.cut(state.step >= self.max_steps)

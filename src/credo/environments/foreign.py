@@ -450,6 +450,7 @@ RECORDED = (
     "actions",
     "observations",
     "shown",
+    "asks",
     "names",
 )
 _WARNED: set[str] = set()

@@ -38,7 +38,7 @@ def _made(id: str, impl: str, settings: tuple[tuple[str, Any], ...]) -> bodies.M
     """An environment by its name, with these settings."""
     hear_mujoco()
     config = registry.get_default_config(id)
-    known = [*_names(config)]
+    known = [name for name in _names(config) if name != "impl"]  # it has a field of its own
     for name, _ in settings:
         require.choice("setting", name, known)
     new = ({"impl": impl} if "impl" in config else {}) | dict(settings)
@@ -46,8 +46,10 @@ def _made(id: str, impl: str, settings: tuple[tuple[str, Any], ...]) -> bodies.M
         config.update_from_flattened_dict(new)
     except TypeError as error:
         raise ValueError(f"{id} was not made: {error}") from error
-    repeat = int(config.action_repeat)
-    steps = int(config.episode_length) // repeat
+    repeat, length = int(config.action_repeat), int(config.episode_length)
+    for name, n in (("action_repeat", repeat), ("episode_length", length)):
+        require.at_least(name, n, 1)
+    steps = -(-length // repeat)  # the last action in full, as Brax counts
     return bodies.made(lambda: registry.load(id, config), id, steps, repeat)
 
 

@@ -44,6 +44,7 @@ SIZES = (
     "actions",
     "observations",
     "shown",
+    "asks",
     "names",
     "obs_range",
     "warnings",

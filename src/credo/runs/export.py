@@ -17,6 +17,7 @@ from .store import Run
 
 Weights = dict[str, np.ndarray]
 SUFFIX = ".safetensors"
+OTHERS = (".onnx", ".pt", ".pth", ".npz", ".npy", ".pkl", ".h5")  # kinds of files that it is not
 PACKAGES = ("brax", "gymnax", "jaxmarl", "jumanji", "playground")
 """Modules of tasks whose ids are those of a package: such a task is called package:id."""
 
@@ -32,7 +33,7 @@ def export(run: Run, path: str | pathlib.Path) -> pathlib.Path:
     **Raises:** `RunError` if the network is none of Credo's, or the folder is not there.
     """
     path = pathlib.Path(path)
-    if path.suffix not in ("", SUFFIX):
+    if path.suffix in OTHERS:
         raise RunError(
             f"{path} ends in {path.suffix}, and a policy is written as {SUFFIX}, or as .onnx by "
             "`credo export`: name it so"
@@ -137,6 +138,7 @@ def _describe(run: Run, network: dict[str, Any]) -> dict[str, Any]:
         "action": task["actions"],
         "observations": task.get("observations"),
         "shown": task.get("shown"),
+        **({"asks": task["asks"]} if "asks" in task else {}),
         "names": task.get("names"),
         "choices": task.get("choices") or (),
         "masked": task.get("masked", False),

@@ -97,12 +97,13 @@ def _graph(step: Any, obs: np.ndarray, memories: list[Any]) -> Any:
 @contextlib.contextmanager
 def _unheard() -> Iterator[None]:
     """jax2onnx prints and logs, with tracebacks, which of its parts this JAX has no use for."""
+    before = logging.root.manager.disable
     logging.disable(logging.ERROR)
     try:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             yield
     finally:
-        logging.disable(logging.NOTSET)
+        logging.disable(before)
 
 
 def _compare(data: bytes, step: Any, obs: np.ndarray, memories: list[PyTree]) -> None:
