@@ -995,8 +995,8 @@ def test_a_champion_of_another_network_is_refused_with_both(credo, tmp_path):
     )
     assert code == 1
     assert "give the same --preset or --network" in err
-    assert "hidden=(4,)" in err
-    assert "hidden=(128, 128)" in err
+    assert "network.hidden: [4] != [128, 128]: give" in err
+    assert "(left) is none of this run's policies (right)" in err
 
 
 # Teams

@@ -267,11 +267,17 @@ def _unlike(algorithm: Any, source: Run, error: Exception) -> str:
             f"the champion of {source.path} was trained with {flag}={flags[0]}, and this run has "
             f"{flag}={flags[1]}: give both the same"
         )
-    network, task = (source.part(name) or config.brief(theirs[name]) for name in ("network", "env"))
+    sizes = ("obs_size", "action_size", "agents")
+    tasks = source.config.get("task", {}), record.task_of(algorithm.env)
+    before, now = ({name: task.get(name) for name in sizes} for task in tasks)
+    told = [
+        *config.differences(before, now),
+        *config.differences(theirs.get("network"), config.to_tree(algorithm.network), "network"),
+    ]
+    differ = "; ".join(told[:6]) or str(error).splitlines()[0]
     return (
-        f"the champion of {source.path} is {network} on {task}, and this run is "
-        f"{algorithm.network} on {algorithm.env}: give the same --preset or --network, and a task "
-        f"of the same sizes ({str(error).splitlines()[0]})"
+        f"the champion of {source.path} (left) is none of this run's policies (right): {differ}: "
+        "give the same --preset or --network settings, and a task of the same sizes"
     )
 
 
