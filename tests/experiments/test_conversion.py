@@ -23,6 +23,9 @@ LINES = {
     for line in (ROOT / "results" / "CONVERSION.md").read_text().splitlines()
     if re.match(r"\| \S+/", line)
 }
+CONVERTED = {  # of files that have had other cells since, those that were converted
+    f"{name}/full": {"preset": "ours"} for name in ("table-3.1", "alg-3.3", "fig-3.6", "fig-3.7")
+}
 IDS = [path.parent.relative_to(ROOT / "results").as_posix() for path in RESULTS]
 
 
@@ -41,8 +44,9 @@ def test_every_converted_file_is_still_there():
 def test_its_values_are_those_of_before_and_its_page_renders(name):
     results = read(ROOT / "results" / name / "results.json")
     if name in LINES:
-        values = [row.value for row in results.rows]
-        values += [y for curve in results.curves for y in curve.values]
+        before = results.where(**CONVERTED.get(name, {}))
+        values = [row.value for row in before.rows]
+        values += [y for curve in before.curves for y in curve.values]
         leaves = list(map(tool.tagged, tool.leaves(values)))
         assert len(leaves) == int(LINES[name][3])
         assert f"{tool.total(leaves):.10g}" == LINES[name][5]
