@@ -58,7 +58,7 @@ def parts(claim: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         for values in itertools.product(*over.values()):
             new = dict(zip(over, values, strict=True))
             told = part.get("of", ", ".join(str(x) for x in values))
-            yield part | {"cell": part.get("cell", {}) | new, "of": told, "new": new}
+            yield part | {"cell": part.get("cell", {}) | new, "of": told}
 
 
 def record(experiment: str, cells: list[dict[str, Any]]) -> tuple[pathlib.Path, dict] | None:
@@ -134,8 +134,8 @@ def found(part: Mapping[str, Any]) -> Found:
     if not mine.size:
         raise ValueError(f"{part}: no row of {path} fits")
     if other is None or "relative" in part:
-        base = 1.0 if other is None else values(second[1], part, other).mean()
-        verdict, text, seeds = level(mine / base, part)
+        unit = 1.0 if other is None else values(second[1], part, other).mean()
+        verdict, text, seeds = level(mine / unit, part)
         # What was reached in less time is reached; that something fails takes all of it.
         whole = had >= 1.0 or (verdict == "reproduced" and not fails(part))
     else:
