@@ -236,7 +236,7 @@ class Team:
             )
         self.choices = [max(sum(kind) for kind in kinds)] if alone else list(kinds.pop())
 
-    def _flat(self, space: Any, seen: bool) -> "Flat":
+    def _flat(self, space: Any, seen: bool) -> Flat:
         """An agent's observations, behind what it may do if there is such a thing."""
         flat = as_flat(without_mask(space) if seen else space)
         return flat.behind(sum(self.choices)) if self.masked else flat
