@@ -51,6 +51,7 @@ SIZES = (
 )
 GRACE = 2.0  # seconds that environments get to close themselves
 FOREVER = 1e9  # seconds: what a timer of the system can hold
+SHORTEST = 1.0  # seconds: what the machine may keep a call waiting is no fault of the environment
 OPENING = 600.0  # seconds that opening one environment may take, if `timeout` is not longer
 LARGEST = float(np.finfo(np.float32).max)
 LOOK = "look at its id and kwargs, and whether its package is installed"
@@ -248,7 +249,8 @@ class Environments:
 class Fatal(Environments):
     """The same, in a process that others can spare: where no worker stands between, an environment
     that ends its process ends this one, and if a call takes longer than `timeout` seconds for all
-    copies together, SIGALRM does. Nor does one stay that uses this signal itself."""
+    copies together, and than `SHORTEST`, SIGALRM does. Nor does one stay that uses this signal
+    itself."""
 
     def __init__(self, spec: dict[str, Any], n: int, timeout: float):
         self._timeout, self._watched = timeout, False
@@ -270,7 +272,7 @@ class Fatal(Environments):
         if self._watched:  # within another call
             return call(*arguments)
         self._watched = True
-        signal.setitimer(signal.ITIMER_REAL, min(max(seconds, 1e-3), FOREVER))
+        signal.setitimer(signal.ITIMER_REAL, min(max(seconds, SHORTEST), FOREVER))
         try:
             return call(*arguments)
         finally:
