@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.stats
+from blocks import Block
 
 from credo.analysis.statistics import bootstrap_interval, probability_of_improvement
 from credo.experiments import base
@@ -26,7 +27,7 @@ from credo.experiments import base
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 RESULTS, PAGE = ROOT / "results", ROOT / "docs" / "results" / "claims.md"
 SOURCE, README = PAGE.with_suffix(".toml"), ROOT / "README.md"
-BEGIN, END = "<!-- claims: python docs/extensions/claims.py -->\n", "<!-- end of claims -->\n"
+BLOCK = Block.of(PAGE, "claims", "docs/extensions/claims.py")
 BUDGETS = ("published", "million", "full", "quick")  # the largest first
 FEWEST = 3  # seeds of a cell that decides
 ENOUGH = 5  # seeds by which a difference that is not seen counts as none
@@ -333,17 +334,9 @@ def count(counted: Mapping[str, int]) -> str:
     return f"{sum(counted.values())} claims: {told}"
 
 
-def page() -> tuple[str, str, str]:
-    """The page: what comes before the claims, the claims, what comes after."""
-    before, _, rest = PAGE.read_text("utf-8").partition(BEGIN)
-    inside, _, after = rest.partition(END)
-    return before + BEGIN, inside, END + after
-
-
 if __name__ == "__main__":
-    before, _, after = page()
     written = table()
-    PAGE.write_text(before + written + after, "utf-8")
+    BLOCK.write(written)
     told = f"on {written[2:].partition('.**')[0]}."
     README.write_text(re.sub(r"on \d+ claims: .*", told, README.read_text("utf-8")), "utf-8")
     sys.stdout.write(written.partition("\n")[0] + "\n")

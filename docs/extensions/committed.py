@@ -6,11 +6,12 @@ python docs/extensions/committed.py      # writes it anew, after results were ad
 import json
 import pathlib
 
+from blocks import Block
+
 from credo.experiments.catalogue import EXPERIMENTS
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "results" / "index.md"
-BEGIN, END = "<!-- table: python docs/extensions/committed.py -->\n", "<!-- end of table -->\n"
+BLOCK = Block.of(ROOT / "docs" / "results" / "index.md", "table", "docs/extensions/committed.py")
 
 
 def table() -> str:
@@ -39,13 +40,5 @@ def row(name: str, title: str, path: pathlib.Path) -> str:
     return f"| {name} | {title} | {path.parent.name} | {part} | {runs} | {link} |"
 
 
-def parts() -> tuple[str, str, str]:
-    """The page: what comes before the table, the table, what comes after."""
-    before, _, rest = PAGE.read_text("utf-8").partition(BEGIN)
-    inside, _, after = rest.partition(END)
-    return before + BEGIN, inside, END + after
-
-
 if __name__ == "__main__":
-    before, _, after = parts()
-    PAGE.write_text(before + table() + after, "utf-8")
+    BLOCK.write(table())

@@ -98,7 +98,12 @@ def test_links_lead_to_files(page):
 
 def test_the_table_of_results_says_what_is_committed():
     committed = loaded("docs/extensions/committed.py")
-    assert committed.parts()[1] == committed.table()
+    assert committed.BLOCK.read() == committed.table()
+
+
+def test_the_tables_of_hybrids_say_what_is_committed():
+    for block, make in loaded("docs/extensions/hybrids.py").BLOCKS.items():
+        assert block.read() == make()
 
 
 def test_readme_says_how_many_experiments_have_no_data():
