@@ -74,19 +74,63 @@ def kept(state):
     return replace(state, replay=jax.tree.map(jnp.copy, state.replay))
 
 
-def test_the_value_of_the_last_state_is_added_in_units_of_the_reward(played):
+def test_the_rest_is_worth_the_lesser_of_two_accounts(played):
+    """In units of the reward, of which critics see half: the value of the last state; or the mean
+    reward of the last two of three steps for the seven that are left, and the value of the last
+    state less the mean of those before."""
     erl, state = played
     given = (state.population, 2)
     _, ahead = play_ahead(erl, kept(state), *given, key=jax.random.key(5))
     before, new = collect(erl.env, *given, limit=jnp.int32(3), key=jax.random.key(5))
-    last = np.asarray(new.last(before).next_obs).reshape(4, 2, 1)
+    first = np.asarray(new.transitions.obs).reshape(4, 2, 10, 1)[:, :, :3]
+    last = np.asarray(new.last(before).next_obs).reshape(4, 2, 1, 1)
+    rewards = np.asarray(new.transitions.rewards["reward"]).reshape(4, 2, 10)[:, :, :3]
     for i in range(4):
         member = tree.take(state.population, i)
         for j in range(2):
-            obs = jnp.asarray(last[i, j])
-            value = state.learners[0].critics[0](obs[:, None], member(obs, None)[0][:, None])
-            expected = float(before.returns["reward"][i, j] + value[0] / 0.5)
+            obs = jnp.asarray(np.concatenate([first[i, j], last[i, j]]))
+            values = np.array(
+                [
+                    state.learners[0].critics[0](x[:, None], member(x, None)[0][:, None])[0]
+                    for x in obs
+                ]
+            )
+            earned, gain = float(before.returns["reward"][i, j]), rewards[i, j, 1:].mean()
+            other = gain * 7 + (values[3] - values[:3].mean()) / 0.5
+            expected = earned + min(values[3] / 0.5, other)
             assert float(ahead.returns["reward"][i, j]) == pytest.approx(expected, rel=1e-4)
+
+
+def test_no_more_steps_are_credited_than_a_discount_looks_ahead(played):
+    erl, state = played
+    given, key = (state.population, 1), jax.random.key(5)
+    near = replace(erl, learners=(replace(LEARNER, gamma=0.5),))
+    far, close = (
+        np.asarray(play_ahead(x, kept(state), *given, key=key)[1].returns["reward"])
+        for x in (erl, near)
+    )
+    _, new = collect(erl.env, *given, limit=jnp.int32(3), key=key)
+    rewards = np.asarray(new.transitions.rewards["reward"]).reshape(4, 1, 10)
+    each = rewards[:, :, 1:3].mean(axis=2)
+    told = far != close  # of the others the critic's own value is the lesser account
+    assert told.any()
+    np.testing.assert_allclose((far - close)[told], each[told] * (7 - 2), rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "env", [Copy(), Gymnasium("InvertedPendulum-v5", in_process=True)], ids=["JAX", "Gymnasium"]
+)
+def test_the_first_transitions_of_every_episode(env):
+    population = draw(NETWORK, env.sizes, 3, key=jax.random.key(0))
+    played, new = collect(env, population, 2, limit=jnp.int32(8), key=jax.random.key(1))
+    seen = np.asarray(new.first(played, 5).obs)
+    assert seen.shape == (6, 5, *new.transitions.obs.shape[1:])
+    rows = np.asarray(new.transitions.obs)
+    steps = np.asarray(played.steps).reshape(-1)
+    starts = np.cumsum(steps) - steps if new.valid is None else np.arange(6) * 10
+    for i in range(6):
+        lived = min(5, steps[i])
+        np.testing.assert_array_equal(seen[i, :lived], rows[starts[i] : starts[i] + lived])
 
 
 def test_the_population_plays_less_and_learners_play_on(played):

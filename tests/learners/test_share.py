@@ -18,19 +18,23 @@ LEARNER = TD3(critic=Critic(hidden=(4,)), batch_size=4)
 SMALL = {"population_size": 4, "elite_fraction": 0.25, "warmup_frames": 0, "sync_period": 1}
 
 
-def test_what_learners_earn_halves_with_each_member_that_is_better():
+def test_what_learners_earn_halves_with_each_better_member_that_evolution_made():
     share = Earned(0.2, 0.8, memory=0.5)
     fitness = jnp.asarray([3.0, 1.0, 2.0, 0.0])
     guests = jnp.asarray([False, False, True, True])
+    bred = ~guests
     # One is better than the best of two: the aim is 0.2 + 0.6/2, and half of the way is gone.
-    assert share.after(jnp.float32(0.4), fitness, guests) == pytest.approx(0.45)
+    assert share.after(jnp.float32(0.4), fitness, guests, bred) == pytest.approx(0.45)
     # The best of all, also in a draw; then two are better: the aim is 0.2 + 0.6/4.
-    assert share.after(jnp.float32(0.4), fitness.at[0].set(2.0), guests) == pytest.approx(0.6)
-    assert share.after(jnp.float32(0.4), fitness.at[1].set(2.5), guests) == pytest.approx(0.375)
+    level, two = fitness.at[0].set(2.0), fitness.at[1].set(2.5)
+    assert share.after(jnp.float32(0.4), level, guests, bred) == pytest.approx(0.6)
+    assert share.after(jnp.float32(0.4), two, guests, bred) == pytest.approx(0.375)
+    # An actor that joined earlier and was changed by nobody is the learners' own work.
     none = jnp.zeros(4, bool)
-    assert share.after(jnp.float32(0.4), fitness, none) == pytest.approx(0.4)
+    assert share.after(jnp.float32(0.4), two, guests, none) == pytest.approx(0.6)
+    assert share.after(jnp.float32(0.4), fitness, none, bred) == pytest.approx(0.4)
     assert share.first() == pytest.approx(0.5)
-    assert Fixed(0.3).after(jnp.float32(0.3), fitness, guests) == pytest.approx(0.3)
+    assert Fixed(0.3).after(jnp.float32(0.3), fitness, guests, bred) == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(("learners", "rounds"), [(0.0, 1), (0.5, 4), (0.75, 12)])

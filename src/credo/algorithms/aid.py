@@ -68,8 +68,8 @@ def play_ahead(
     hybrid: Hybrid, state: HybridState, policies: PyTree, episodes: int, *, key: Key
 ) -> Played:
     """`play` for as many steps as the hybrid's `horizon` says, once the learner has learned and
-    unless the task pays late. To the returns of episodes that were cut short the value of their
-    last state is added."""
+    unless the task pays late. To the returns of episodes that were cut short is added what the rest
+    is worth."""
     assert hybrid.horizon is not None
     most = jnp.int32(hybrid.env.max_steps)
     short = state.learned & ~state.late
@@ -85,31 +85,48 @@ def play_ahead(
     after = stored(hybrid, replace(state, late=late), played, new)
     if not len(new.transitions.terminated):  # every episode was lost
         return after, played
-    rest = _rest(about, policies, new.last(played), cut)
+    room = min(hybrid.horizon.steps, hybrid.env.max_steps)
+    met = new.first(played, room), new.last(played)
+    rest = _rest(about, policies, played.steps, hybrid.reward, met, most - limit)
+    rest = jnp.where(cut, rest, 0.0)
     returns = played.returns | {hybrid.reward: played.of(hybrid.reward) + rest}
     return after, replace(played, returns=returns)
 
 
 @jit
 def _rest(
-    about: PyTree, policies: PyTree, last: Transition, cut: Bool[Array, "pop episodes"]
+    about: PyTree,
+    policies: PyTree,
+    steps: Int[Array, "pop episodes"],
+    reward: str,
+    met: tuple[Transition, Transition],
+    left: Int[Array, ""],
 ) -> Float[Array, "pop episodes"]:
-    """What the critic says of the states in which episodes were `cut`, in units of the reward; 0 of
-    those that terminated just then, and of all others."""
+    """What the steps that are `left` of episodes that were cut are worth, in units of the reward; 0
+    of those that terminated just then. `met`: their transitions, and the last one."""
     learner, state, moments = about
-    obs = seen(moments, jnp.asarray(last.next_obs)).reshape(*cut.shape, *last.next_obs.shape[1:])
+    before, last = jax.tree.map(jnp.asarray, met)
+    obs = jnp.concatenate([before.obs, last.next_obs[:, None]], axis=1)
+    obs = seen(moments, obs).reshape(*steps.shape, *obs.shape[1:])
     arrays, static = eqx.partition(policies, eqx.is_array)
 
     def one(given: tuple[PyTree, Array]) -> Array:
-        member, obs = eqx.combine(given[0], static), given[1]
+        member, obs = eqx.combine(given[0], static), given[1].reshape(-1, *given[1].shape[2:])
         none = jnp.zeros(obs.shape[:-1])
         off = none.astype(bool)
         batch = Batch(obs, act(member, obs), none, obs, off, off)
-        return learner.value(state, member, batch).reshape(len(obs), -1).mean(axis=1)
+        value = learner.value(state, member, batch).reshape(len(obs), -1).mean(axis=1)
+        return value.reshape(given[1].shape[:2])
 
-    value = jax.lax.map(one, (arrays, obs)) / jnp.maximum(learner.reward_scale, 1e-8)
-    over = jnp.asarray(last.terminated).reshape(*cut.shape, -1).all(axis=-1)
-    return jnp.where(cut & ~over, value, 0.0)
+    values = jax.lax.map(one, (arrays, obs)) / jnp.maximum(learner.reward_scale, 1e-8)
+    steps, at = jnp.asarray(steps)[..., None], jnp.arange(obs.shape[2] - 1)[None, None]
+    usual = jnp.mean(values[..., :-1], axis=-1, where=at < steps)
+    rewards = before.rewards[reward].reshape(*values[..., :-1].shape, -1).mean(axis=-1)
+    gain = jnp.mean(rewards, axis=-1, where=(at < steps) & (at >= steps // 2))
+    further = jnp.minimum(left.astype(jnp.float32), 1.0 / (1.0 - learner.gamma))
+    over = last.terminated.reshape(*gain.shape, -1).all(axis=-1)
+    rest = jnp.minimum(values[..., -1], gain * further + values[..., -1] - usual)
+    return jnp.where(over, 0.0, rest)
 
 
 class Preselecting(AbstractBreeder):

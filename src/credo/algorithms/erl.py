@@ -168,7 +168,7 @@ class ERL(Hybrid):
         say by what."""
         if env.agents is not None:
             raise ValueError("hybrid is for one agent: train a team by merl, or MERL.merl(env)")
-        settings: dict[str, Any] = {"learners": (modern(),), "share": Earned(0.7, 0.9)}
+        settings: dict[str, Any] = {"learners": (modern(),), "share": Earned(0.6, 0.85)}
         settings |= {"elite_fraction": 0.2, "sync_period": 1, "redistribute": Decomposed()}
         settings |= {"warmup_frames": 5_000, "horizon": Truncated(200)}
         if not overrides.get("learners", True):  # evolution alone: nobody to share with or to ask

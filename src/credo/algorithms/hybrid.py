@@ -32,7 +32,7 @@ from ..replay import Replay, Sampling, extend
 from ..rollout import Environment, Experience, blank, collect
 from ..types import Evaluation, Metrics
 from .fitness import objective, retested
-from .lineage import Lineage
+from .lineage import INJECTED, Lineage
 
 
 def _field(start: float, dtype: Callable[..., Any]) -> Any:
@@ -286,8 +286,8 @@ def observed(hybrid: Hybrid, state: HybridState, i: int, mine, played: Evaluatio
 def balance(hybrid: Hybrid, state: HybridState, fitness: Fitness) -> HybridState:
     """With the share of frames that learners get in this generation."""
     assert hybrid.share is not None
-    guests = state.lineage.guest >= 0
-    return replace(state, share=hybrid.share.after(state.share, rankable(fitness), guests))
+    guests, bred = state.lineage.guest >= 0, state.lineage.maker != INJECTED
+    return replace(state, share=hybrid.share.after(state.share, rankable(fitness), guests, bred))
 
 
 def teach(hybrid: Hybrid, state: HybridState, frames: Frames, *, keys: tuple[Key, Key]) -> Result:

@@ -5,18 +5,24 @@ Source: Hao et al. (2023), "ERL-Re²: efficient evolutionary reinforcement learn
 representation and individual policy representation", whose surrogate fitness is that of H steps and
 the value of the last state.
 
-A member's fitness is its return until it is cut off and the critic's value of the state in which
-it is, with the member's own action there. All members of a generation are cut after as many steps,
-so that their fitness is comparable; a member whose episode terminated before has its return alone.
-The value is discounted by the learner's γ, while returns are not: it stands for about 1/(1 - γ)
-further steps. Tests of champions and the learners' own episodes are whole ones, and so are all
-while no member was ever paid before the last step of an episode: what is cut off there is the whole
-return. Where some episodes are paid at their end alone and others before, a redistribution that is
-late_only still spreads the former for the critic, which then adds the rest of their return alone.
+A member's fitness is its return until it is cut off, and what the rest is worth, the lesser of two
+accounts:
 
-Departures: they discount the H rewards too, use a value function that takes the policy as an input,
-and evaluate like this with some probability; here it is the learner's own critic, in every
-generation.
+- the critic's value of the state in which it is, with the member's own action there. Of a member
+  that no learner has trained it is a guess, and of its learner's newest actor too high;
+- what the member earned per step in the second half, for as many further steps as are left, but no
+  more than the learner's discount looks ahead, 1/(1 - γ); and by how much the critic values the
+  state in which it is above those in which it was. There the critic's level cancels, as in a
+  differential value (Sutton & Barto 2018, section 10.3), but so does the fall that it expects.
+
+All members of a generation are cut after as many steps, so that their fitness is comparable; a
+member whose episode terminated before has its return alone. Tests of champions and the learners'
+own episodes are whole ones, and so are all while no member was ever paid before the last step of an
+episode: what is cut off there is the whole return.
+
+Departures: they discount the H rewards too, take the value as it is, of a value function that has
+the policy as an input, and evaluate like this with some probability; here it is the learner's own
+critic, in every generation.
 """
 
 import equinox as eqx
@@ -54,7 +60,8 @@ class AbstractHorizon(eqx.Module):
 class Truncated(AbstractHorizon):
     """The same number of steps in every generation."""
 
-    steps: int = 200  # most steps of an episode of the population, at least 1
+    steps: int = eqx.field(static=True, default=200)
+    """Most steps of an episode of the population, at least 1."""
 
     def __check_init__(self):
         require.at_least("steps", self.steps, 1)

@@ -33,10 +33,15 @@ class AbstractShare(eqx.Module):
 
     @abc.abstractmethod
     def after(
-        self, share: Float[Array, ""], fitness: Float[Array, " pop"], guests: Bool[Array, " pop"]
+        self,
+        share: Float[Array, ""],
+        fitness: Float[Array, " pop"],
+        guests: Bool[Array, " pop"],
+        bred: Bool[Array, " pop"],
     ) -> Float[Array, ""]:
         """The next share, once a population has a `fitness` (of numbers) in which `guests` are
-        actors of learners that joined it just before."""
+        actors of learners that joined it just before. `bred`: what evolution has drawn or changed;
+        the others are actors of learners as they once joined."""
 
 
 class Fixed(AbstractShare):
@@ -56,14 +61,15 @@ class Fixed(AbstractShare):
     def first(self) -> float:
         return self.learners
 
-    def after(self, share, fitness, guests):
+    def after(self, share, fitness, guests, bred):
         return share
 
 
 class Earned(AbstractShare):
     """As many frames as the learners' actors have earned: what their share tends to is the most
-    while the best of those that just joined is the best of the population, and halves, down to the
-    least, with each member of the population's own that is better."""
+    while no member that evolution has made is better than the best of those that just joined, and
+    halves, down to the least, with each that is. An actor of an earlier generation that nobody has
+    changed is still the learners' work."""
 
     least: float = eqx.field(static=True, default=0.1)  # no share is smaller, in [0, most]
     most: float = eqx.field(static=True, default=0.9)  # no share is larger, in [least, 1)
@@ -79,9 +85,9 @@ class Earned(AbstractShare):
     def first(self) -> float:
         return 0.5 * (self.least + self.most)
 
-    def after(self, share, fitness, guests):
+    def after(self, share, fitness, guests, bred):
         best = jnp.max(fitness, initial=-jnp.inf, where=guests)
-        better = jnp.sum((fitness > best) & ~guests)
+        better = jnp.sum((fitness > best) & bred)
         aim = self.least + (self.most - self.least) * jnp.exp2(-better.astype(jnp.float32))
         told = jnp.any(guests) & jnp.any(fitness > -jnp.inf)
         return jnp.where(told, share + self.memory * (aim - share), share)
