@@ -13,7 +13,9 @@ from credo.algorithms.neat import NEAT
 from credo.algorithms.neuroevolution import Neuroevolution
 from credo.algorithms.off_policy import OffPolicy
 from credo.algorithms.ppo import PPO
+from credo.environments.gymnasium import Gymnasium
 from credo.environments.probes import Copy, Meet, Remember
+from credo.learners.horizon import Truncated
 from credo.learners.sac import SAC
 from credo.learners.td3 import TD3, ddpg, maddpg, matd3
 from credo.networks.graph import Graph
@@ -38,6 +40,13 @@ MAKE = {
     "bptt": lambda: BPTT(Remember(2), MMU(hidden=2), batch_size=2, test_episodes=1),
     "ccea": lambda: CCEA.ccea(MEET, NETWORK, teams=1, **EVOLUTION),
     "erl": lambda: ERL.erl(COPY, NETWORK, learners=(ddpg(**TINY),), **HYBRID),
+    "a horizon": lambda: ERL.erl(
+        Gymnasium("InvertedPendulum-v5", in_process=True),
+        NETWORK,
+        learners=(TD3(**TINY),),
+        horizon=Truncated(4),
+        **HYBRID,
+    ),
     "cerl": lambda: ERL.cerl(COPY, NETWORK, learners=(TD3(**TINY),), **HYBRID),
     "ea": lambda: ERL.ea(COPY, NETWORK, **HYBRID),
     "merl": lambda: MERL.merl(MEET, TEAM, learners=(TD3(signal="local", **TINY),), **HYBRID),

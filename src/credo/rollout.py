@@ -87,16 +87,17 @@ class Experience(eqx.Module):
             at = jnp.arange(steps.size) * most + steps - 1
         return jax.tree.map(lambda x: x[at], self.transitions)
 
-    def first(self, played: Evaluation, most: int) -> Transition:
-        """The first `most` transitions of every episode, `[pop·episodes, most, ...]`. Behind its
-        end, and of one that was lost or not played, they mean nothing."""
+    def first(self, leaves: PyTree, played: Evaluation, most: int) -> PyTree:
+        """Of some `leaves` of the transitions the first `most` rows of every episode,
+        `[pop·episodes, most, ...]`. Those past its end are meaningless, and all of one that was
+        lost or not played."""
         rows, number = len(self.transitions.terminated), played.steps.size
         if self.valid is None:  # the episodes, one behind the other, without the lost ones
             lived = self.lived(played)
             at = (np.cumsum(lived) - lived)[:, None] + np.arange(most)[None]
         else:
             at = (jnp.arange(number) * (rows // number))[:, None] + jnp.arange(most)[None]
-        return jax.tree.map(lambda x: x[at.clip(0, rows - 1)], self.transitions)
+        return jax.tree.map(lambda x: x[at.clip(0, rows - 1)], leaves)
 
 
 @float32()

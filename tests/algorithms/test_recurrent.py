@@ -189,7 +189,7 @@ def test_what_memory_cannot_have_is_refused():
         ValueError, match="batch_size is 16 and window is 20: a network with memory"
     ):
         PPO(TASK, GRU, batch_size=16, window=20)
-    with pytest.raises(ValueError, match="a horizon asks the critic about the last step alone"):
+    with pytest.raises(ValueError, match="a horizon asks the critic about single steps"):
         ERL(TASK, GRU, (LEARNERS["td3"],), horizon=Truncated(2))
     with pytest.raises(TypeError, match="HistoryCritic values windows of an episode"):
         run(OffPolicy(TASK, MLP(), LEARNERS["td3"], **SETTINGS), 20)

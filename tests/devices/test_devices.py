@@ -98,6 +98,8 @@ def test_more_devices_than_there_are_or_a_task_that_knows_none(tmp_path):
     outside = Neuroevolution(Gymnasium("Pendulum-v1"), MLP(hidden=(2,)), population_size=4)
     with pytest.raises(ValueError, match=r"Gymnasium does not run in JAX.*--processes"):
         credo.train(outside, devices=2, **options)
+    with pytest.raises(ValueError, match=r"processes is 2, and Copy runs in JAX.*--devices"):
+        credo.train(evolve, processes=2, **options)
     with pytest.raises(ValueError, match="devices is 0: it must be at least 1"):
         credo.train(evolve, devices=0, **options)
     assert not (tmp_path / "run").exists()

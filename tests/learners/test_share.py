@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from credo.algorithms.erl import ERL
+from credo.algorithms.hybrid import balance
+from credo.algorithms.lineage import COACHED, DRAWN, INJECTED, MAKERS
 from credo.environments.probes import Copy
 from credo.learners.share import Earned, Fixed
 from credo.learners.td3 import TD3
@@ -35,6 +37,23 @@ def test_what_learners_earn_halves_with_each_better_member_that_evolution_made()
     assert share.after(jnp.float32(0.4), fitness, none, bred) == pytest.approx(0.4)
     assert share.first() == pytest.approx(0.5)
     assert Fixed(0.3).after(jnp.float32(0.3), fitness, guests, bred) == pytest.approx(0.3)
+
+
+def test_only_what_evolution_made_counts_against_learners():
+    """Actors that joined, and members that a critic's gradient moved, are the learners' work."""
+    erl = ERL.erl(Copy(), MLP((4,)), learners=(LEARNER,), share=Earned(0.2, 0.8), **SMALL)
+    state = erl.init(key=jax.random.key(0))
+    guest = jnp.array([-1, -1, -1, 0])
+    fitness = jnp.array([3.0, 0.0, 0.0, 1.0])
+    shares = []
+    for maker in range(len(MAKERS)):
+        made = jnp.array([maker, DRAWN, DRAWN, INJECTED])
+        lineage = dataclasses.replace(state.lineage, guest=guest, maker=made)
+        after = balance(erl, dataclasses.replace(state, lineage=lineage), fitness)
+        shares.append(float(after.share))
+    most, half = 0.65, 0.5
+    expected = [most if m in (INJECTED, COACHED) else half for m in range(len(MAKERS))]
+    assert shares == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("learners", "rounds"), [(0.0, 1), (0.5, 4), (0.75, 12)])

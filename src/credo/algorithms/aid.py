@@ -21,7 +21,7 @@ from ..learners.base import act, scaled
 from ..learners.surrogate import AbstractSurrogate
 from ..normalization import behind, seen
 from ..rollout import collect
-from ..types import Batch, Metrics, Transition
+from ..types import Batch, Metrics
 from .hybrid import Fitness, Hybrid, HybridState, Key, Played, Result, breed, stored
 
 
@@ -83,11 +83,12 @@ def play_ahead(
     about = (learner, state.learners[0], state.moments)
     late = state.late & jnp.all(new.late(played, hybrid.reward))
     after = stored(hybrid, replace(state, late=late), played, new)
-    if not len(new.transitions.terminated):  # every episode was lost
+    whole = hybrid.horizon.steps >= hybrid.env.max_steps
+    if whole or not len(new.transitions.terminated):  # nothing is cut, or every episode was lost
         return after, played
-    room = min(hybrid.horizon.steps, hybrid.env.max_steps)
-    met = new.first(played, room), new.last(played)
-    rest = _rest(about, policies, played.steps, hybrid.reward, met, most - limit)
+    rows, last = new.transitions, new.last(played)
+    met = new.first((rows.obs, rows.rewards[hybrid.reward]), played, hybrid.horizon.steps)
+    rest = _rest(about, policies, played.steps, met, (last.next_obs, last.terminated), most - limit)
     rest = jnp.where(cut, rest, 0.0)
     returns = played.returns | {hybrid.reward: played.of(hybrid.reward) + rest}
     return after, replace(played, returns=returns)
@@ -98,35 +99,45 @@ def _rest(
     about: PyTree,
     policies: PyTree,
     steps: Int[Array, "pop episodes"],
-    reward: str,
-    met: tuple[Transition, Transition],
+    met: tuple[Array, Array],
+    last: tuple[Array, Array],
     left: Int[Array, ""],
 ) -> Float[Array, "pop episodes"]:
     """What the steps that are `left` of episodes that were cut are worth, in units of the reward; 0
-    of those that terminated just then. `met`: their transitions, and the last one."""
+    of those that terminated just then. `met`: their observations and rewards, of as many steps as
+    are played at most. `last`: the observation behind the last one, and whether they terminated."""
     learner, state, moments = about
-    before, last = jax.tree.map(jnp.asarray, met)
-    obs = jnp.concatenate([before.obs, last.next_obs[:, None]], axis=1)
-    obs = seen(moments, obs).reshape(*steps.shape, *obs.shape[1:])
+    obs, rewards = (jnp.asarray(x).reshape(*steps.shape, *x.shape[1:]) for x in met)
+    final, over = (jnp.asarray(x).reshape(*steps.shape, *x.shape[1:]) for x in last)
     arrays, static = eqx.partition(policies, eqx.is_array)
 
-    def one(given: tuple[PyTree, Array]) -> Array:
-        member, obs = eqx.combine(given[0], static), given[1].reshape(-1, *given[1].shape[2:])
-        none = jnp.zeros(obs.shape[:-1])
+    def one(given: tuple[PyTree, Array, Array]) -> Array:
+        arrays, before, behind = given
+        member, obs = (
+            eqx.combine(arrays, static),
+            jnp.concatenate([before, behind[:, None]], axis=1),
+        )
+        rows = seen(moments, obs.reshape(-1, *obs.shape[2:]))
+        none = jnp.zeros(rows.shape[:-1])
         off = none.astype(bool)
-        batch = Batch(obs, act(member, obs), none, obs, off, off)
-        value = learner.value(state, member, batch).reshape(len(obs), -1).mean(axis=1)
-        return value.reshape(given[1].shape[:2])
+        batch = Batch(rows, act(member, rows), none, rows, off, off)
+        return learner.value(state, member, batch).reshape(*obs.shape[:2], -1).mean(axis=-1)
 
-    values = jax.lax.map(one, (arrays, obs)) / jnp.maximum(learner.reward_scale, 1e-8)
-    steps, at = jnp.asarray(steps)[..., None], jnp.arange(obs.shape[2] - 1)[None, None]
-    usual = jnp.mean(values[..., :-1], axis=-1, where=at < steps)
-    rewards = before.rewards[reward].reshape(*values[..., :-1].shape, -1).mean(axis=-1)
-    gain = jnp.mean(rewards, axis=-1, where=(at < steps) & (at >= steps // 2))
+    values = jax.lax.map(one, (arrays, obs, final)) / jnp.maximum(learner.reward_scale, 1e-8)
+    value, before = values[..., -1], values[..., :-1]
+    room, rewards = before.shape[-1], rewards.reshape(*before.shape, -1).mean(axis=-1)
+    count, at = jnp.minimum(jnp.asarray(steps), room)[..., None], jnp.arange(room)[None, None]
+    gain = _mean(rewards, (at < count) & (at >= count // 2))
     further = jnp.minimum(left.astype(jnp.float32), 1.0 / (1.0 - learner.gamma))
-    over = last.terminated.reshape(*gain.shape, -1).all(axis=-1)
-    rest = jnp.minimum(values[..., -1], gain * further + values[..., -1] - usual)
-    return jnp.where(over, 0.0, rest)
+    earned = gain * further + value - _mean(before, at < count)
+    over = over.reshape(*steps.shape, -1).all(axis=-1)
+    return jnp.where(over, 0.0, jnp.minimum(value, earned))
+
+
+def _mean(x: Array, there: Bool[Array, "pop episodes steps"]) -> Float[Array, "pop episodes"]:
+    """Over the steps that are there; 0 of none."""
+    number = jnp.sum(there, axis=-1, dtype=jnp.float32)
+    return jnp.sum(x, axis=-1, where=there) / jnp.maximum(number, 1.0)
 
 
 class Preselecting(AbstractBreeder):

@@ -107,8 +107,8 @@ class ERL(Hybrid):
     """Breeds more offspring than are played, of which the critic of the first learner chooses;
     None: all are played."""
     horizon: AbstractHorizon | None = None
-    """Cuts the population's episodes short, with the value that the critic of the first learner
-    gives to the rest; None: episodes are played to the end."""
+    """Cuts the population's episodes short, and says what the rest is worth by the critic of the
+    first learner; None: episodes are played to the end."""
     sync_period: int = eqx.field(static=True, default=10)  # ω: generations between injections, ≥ 1
     sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     updates_per_frame: float = 1.0  # gradient updates of each learner per frame played, ≥ 0
@@ -163,9 +163,9 @@ class ERL(Hybrid):
     @classmethod
     def hybrid(cls, env: Environment, network: AbstractNetwork | None = None, **overrides) -> Self:
         """One preset for dense and late rewards: policies that mutation moves, judged by 200 steps
-        and the critic, beside a learner of this decade that earns its frames, joins every
-        generation, and sees late returns decomposed. Chosen on seeds from 1000 on; docs, hybrid,
-        say by what."""
+        and what follows from them and the critic, beside a learner of this decade that earns its
+        frames, joins every generation, and sees late returns decomposed. Chosen on seeds from 1000
+        on; docs, hybrid, say by what."""
         if env.agents is not None:
             raise ValueError("hybrid is for one agent: train a team by merl, or MERL.merl(env)")
         settings: dict[str, Any] = {"learners": (modern(),), "share": Earned(0.6, 0.85)}
@@ -173,7 +173,7 @@ class ERL(Hybrid):
         settings |= {"warmup_frames": 5_000, "horizon": Truncated(200)}
         if not overrides.get("learners", True):  # evolution alone: nobody to share with or to ask
             settings |= {"share": None, "horizon": None, "redistribute": None}
-        elif network is not None and network.remembers:  # the critic cannot judge a last step alone
+        elif network is not None and network.remembers:  # the critic cannot judge single steps
             settings = in_windows(env, network, settings) | {"horizon": None}
         return cls(env, network or HYBRID_NETWORK, **evolving(BREEDER, settings, overrides))
 

@@ -32,7 +32,7 @@ from ..replay import Replay, Sampling, extend
 from ..rollout import Environment, Experience, blank, collect
 from ..types import Evaluation, Metrics
 from .fitness import objective, retested
-from .lineage import INJECTED, Lineage
+from .lineage import COACHED, INJECTED, Lineage
 
 
 def _field(start: float, dtype: Callable[..., Any]) -> Any:
@@ -110,7 +110,7 @@ class Hybrid(eqx.Module):
             self.surrogate.check(self.breeder, self.learners)
         if self.horizon is not None and self.network.remembers:
             raise ValueError(
-                "a horizon asks the critic about the last step alone, and "
+                "a horizon asks the critic about single steps, and "
                 f"{require.named(self.network)} has memory: give horizon=None"
             )
         if self.horizon is not None:
@@ -286,7 +286,8 @@ def observed(hybrid: Hybrid, state: HybridState, i: int, mine, played: Evaluatio
 def balance(hybrid: Hybrid, state: HybridState, fitness: Fitness) -> HybridState:
     """With the share of frames that learners get in this generation."""
     assert hybrid.share is not None
-    guests, bred = state.lineage.guest >= 0, state.lineage.maker != INJECTED
+    guests, maker = state.lineage.guest >= 0, state.lineage.maker
+    bred = (maker != INJECTED) & (maker != COACHED)  # both are a learner's work
     return replace(state, share=hybrid.share.after(state.share, rankable(fitness), guests, bred))
 
 

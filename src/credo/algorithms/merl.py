@@ -102,8 +102,8 @@ class MERL(Hybrid):
     """Breeds more offspring than are played, of which the critic of the first learner chooses;
     None: all are played."""
     horizon: AbstractHorizon | None = None
-    """Cuts the population's episodes short, with the value that the critic of the first learner
-    gives to the rest; None: episodes are played to the end."""
+    """Cuts the population's episodes short, and says what the rest is worth by the critic of the
+    first learner; None: episodes are played to the end."""
     migration_period: int = eqx.field(static=True, default=1)  # generations between migrations, ≥ 1
     sampling: Sampling = Sampling()  # how minibatches are drawn from the replay buffer
     updates_per_frame: float = 0.1  # updates of each learner, for all agents, per frame played, ≥ 0

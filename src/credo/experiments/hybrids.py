@@ -6,9 +6,9 @@ paid at the last step; beside the learner that sees returns as they are paid sta
 preset, which sees them decomposed. Shared rewards are beyond-7-decoys.
 
 The preset was chosen on seeds from 1,000 on, with up to 300,000 frames of the four tasks; reported
-runs have seeds from 0 on. Those of the hybrid with rewards at every step have seeds from 10 on: how
-members are judged and who gets the frames was changed after the curves of seeds 0 to 2 had been
-looked at (docs, hybrid).
+runs have seeds from 0 on. Those of the hybrid have seeds from 10 on: how members are
+judged and who gets the frames were changed after the curves of seeds 0 to 2 had been looked at
+(docs, hybrid).
 """
 
 from collections.abc import Sequence
@@ -29,6 +29,7 @@ METHODS = {
     LEARNER: partial(OffPolicy.hybrid, redistribute=None),
     EVOLUTION: partial(ERL.hybrid, learners=()),
 }
+FIRST = {HYBRID: 10}  # the first seed; of all others 0
 DENSE = {
     "smoke": Plan(600, 2),
     "quick": Plan(50_000, 2, 0.25),
@@ -45,9 +46,9 @@ def tasks(budget: str) -> Sequence[str]:
 
 def dense(budget: str) -> list[Cell]:
     """Every method on every task."""
-    runs, first = DENSE[budget], {HYBRID: 10}
+    runs = DENSE[budget]
     return [
-        cell(x, METHODS[x], task, budget, runs=runs, first_seed=first.get(x, 0))
+        cell(x, METHODS[x], task, budget, runs=runs, first_seed=FIRST.get(x, 0))
         for task in tasks(budget)
         for x in METHODS
     ]
@@ -57,9 +58,11 @@ def late(budget: str) -> list[Cell]:
     """The same with returns at the last step, and the learner that sees them decomposed."""
     methods = METHODS | {DECOMPOSED: OffPolicy.hybrid}
     return [
-        cell(name, build, task, budget, delayed=True, runs=LATE[budget])
+        cell(
+            x, methods[x], task, budget, delayed=True, runs=LATE[budget], first_seed=FIRST.get(x, 0)
+        )
         for task in tasks(budget)
-        for name, build in methods.items()
+        for x in methods
     ]
 
 

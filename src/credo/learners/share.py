@@ -41,7 +41,7 @@ class AbstractShare(eqx.Module):
     ) -> Float[Array, ""]:
         """The next share, once a population has a `fitness` (of numbers) in which `guests` are
         actors of learners that joined it just before. `bred`: what evolution has drawn or changed;
-        the others are actors of learners as they once joined."""
+        the others are actors of learners as they once joined, or were moved by a critic."""
 
 
 class Fixed(AbstractShare):
@@ -66,8 +66,8 @@ class Fixed(AbstractShare):
 
 
 class Earned(AbstractShare):
-    """As many frames as the learners' actors have earned: what their share tends to is the most
-    while no member that evolution has made is better than the best of those that just joined, and
+    """As many frames as the learners' actors have earned: their share tends to the most as long as
+    no member that evolution has made is better than the best of those that just joined, and
     halves, down to the least, with each that is. An actor of an earlier generation that nobody has
     changed is still the learners' work."""
 

@@ -222,6 +222,15 @@ class _Current(threading.local):
 _CURRENT = _Current()
 
 
+def require(number: int | None, task: Any) -> None:
+    """Raise `ValueError` if several processes are to play a task that is played in this one."""
+    if number is not None and number > 1 and not isinstance(task, AbstractHostEnvironment):
+        raise ValueError(
+            f"processes is {number}, and {type(task).__name__} runs in JAX: its episodes are all "
+            "played in one process; leave it out (--devices shares them out among devices)"
+        )
+
+
 @contextlib.contextmanager
 def using(number: int | None, on: str = "local") -> Iterator[None]:
     """In here this thread's rollouts are shared out among so many processes; None: one for each

@@ -113,6 +113,7 @@ def train(
     if isinstance(seed, bool) or not (isinstance(seed, int) and 0 <= seed < 2**32):
         raise ValueError(f"seed is {seed}: it must be a whole number from 0 to 2^32 - 1")
     devices.require(options.devices, algorithm.env)
+    players.require(options.processes, algorithm.env)
     path = pathlib.Path(path) if path else free_name(algorithm, seed)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_where(algorithm, options))
@@ -162,6 +163,7 @@ def resume(
         run = Run(path, trust=trust)
         recorded = run.algorithm
         devices.require(options.devices, recorded.env)
+        players.require(changes.get("processes"), recorded.env)  # a record may be of older versions
         with _where(recorded, options):
             fit, saved = _reopened(run, options, dict(set or {}), without_replay)
             if run.config != record.read(run.path) or (trust and not signed_here(run.config)):
