@@ -277,7 +277,7 @@ def test_a_reset_that_fails_leaves_the_others_theirs():
 
 def test_every_copy_has_its_own_time():
     copies = Gymnasium(
-        "failing:Slow", kwargs={"opening": 0.5, "step": 0.4}, max_episode_steps=2, timeout=1.0
+        "failing:Slow", kwargs={"opening": 0.5, "step": 0.7}, max_episode_steps=2, timeout=2.0
     ).copies(4)
     assert lived(copies, 0) == [2, 2, 2, 2]
     copies.close()
