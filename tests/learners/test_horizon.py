@@ -23,8 +23,8 @@ from credo.learners.td3 import TD3
 from credo.networks.mlp import MLP, Critic
 from credo.networks.team import Team
 from credo.normalization import behind
-from credo.rollout import collect
-from credo.types import Batch
+from credo.rollout import Experience, collect
+from credo.types import Batch, Evaluation, Transition
 
 NETWORK = MLP((4,))
 LEARNER = TD3(critic=Critic(hidden=(4,)), batch_size=8, reward_scale=0.5)
@@ -233,3 +233,18 @@ def test_episodes_are_whole_where_all_is_paid_at_their_last_step():
 def test_bad_horizons_are_refused(make, said):
     with pytest.raises(ValueError, match=said):
         make()
+
+
+def test_a_lost_episode_leaves_no_rows_and_the_others_keep_theirs():
+    """Three episodes outside JAX, of which the second was lost: rows of the first and third."""
+    column = np.arange(5, dtype=np.float32)
+    off = np.zeros(5, bool)
+    rows = Transition(
+        column[:, None], column[:, None], {"reward": column}, column[:, None], off, off
+    )
+    returns = np.array([[3.0], [np.nan], [7.0]], np.float32)
+    played = Evaluation({"reward": returns}, np.array([[3], [4], [2]], np.int32))
+    found = Experience(rows, None).first(rows.obs, played, 3)[..., 0]
+    assert found.shape == (3, 3)
+    np.testing.assert_array_equal(found[0], [0, 1, 2])
+    np.testing.assert_array_equal(found[2, :2], [3, 4])
