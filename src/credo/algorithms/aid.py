@@ -112,11 +112,9 @@ def _rest(
     arrays, static = eqx.partition(policies, eqx.is_array)
 
     def one(given: tuple[PyTree, Array, Array]) -> Array:
-        arrays, before, behind = given
-        member, obs = (
-            eqx.combine(arrays, static),
-            jnp.concatenate([before, behind[:, None]], axis=1),
-        )
+        arrays, before, final = given
+        member = eqx.combine(arrays, static)
+        obs = jnp.concatenate([before, final[:, None]], axis=1)
         rows = seen(moments, obs.reshape(-1, *obs.shape[2:]))
         none = jnp.zeros(rows.shape[:-1])
         off = none.astype(bool)

@@ -6,9 +6,8 @@ paid at the last step; beside the learner that sees returns as they are paid sta
 preset, which sees them decomposed. Shared rewards are beyond-7-decoys.
 
 The preset was chosen on seeds from 1,000 on, with up to 300,000 frames of the four tasks; reported
-runs have seeds from 0 on. Those of the hybrid have seeds from 10 on: how members are
-judged and who gets the frames were changed after the curves of seeds 0 to 2 had been looked at
-(docs, hybrid).
+runs have seeds from 0 on. Those of the hybrid have seeds from 10 on: how members are judged and who
+gets the frames were changed after the curves of seeds 0 to 2 had been looked at (docs, hybrid).
 """
 
 from collections.abc import Sequence

@@ -68,8 +68,8 @@ class Fixed(AbstractShare):
 class Earned(AbstractShare):
     """As many frames as the learners' actors have earned: their share tends to the most as long as
     no member that evolution has made is better than the best of those that just joined, and
-    halves, down to the least, with each that is. An actor of an earlier generation that nobody has
-    changed is still the learners' work."""
+    halves, down to the least, with each that is. An actor of an earlier generation that was not
+    changed since is still the learners' work."""
 
     least: float = eqx.field(static=True, default=0.1)  # no share is smaller, in [0, most]
     most: float = eqx.field(static=True, default=0.9)  # no share is larger, in [least, 1)
