@@ -84,8 +84,14 @@ def _founded(
     others; and the genome that founds a species, -1: it is an old one, or none."""
     turn = jnp.arange(population.weight.shape[0], dtype=jnp.int32)
     from_all = jax.vmap(distance, in_axes=(0, None))
-    away = jax.vmap(lambda one: from_all(population, one), out_axes=1)(representative)
-    away = jnp.where(alive[None], away, jnp.inf)
+    first = jnp.argsort(~alive, stable=True)  # the places of those that there are
+
+    def measured(i: Array, away: Array) -> Array:
+        one = tree.take(representative, first[i])
+        return away.at[:, first[i]].set(from_all(population, one))
+
+    away = jnp.full((len(turn), len(alive)), jnp.inf)
+    away = jax.lax.fori_loop(0, jnp.sum(alive, dtype=jnp.int32), measured, away)
 
     def alone(away: Array) -> Bool[Array, " pop"]:
         return ~jnp.any(away < threshold, axis=1)
