@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from credo.algorithms.neat import NEAT
 from credo.algorithms.neuroevolution import Neuroevolution
@@ -18,8 +19,8 @@ from credo.networks.graph import Graph, GraphPolicy
 from credo.networks.mlp import MLP
 from credo.networks.mmu import MMU
 from credo.networks.ntm import NTM
-from credo.report import champions, run_page
-from credo.report.sections import Drawing, Figure, HeatMap, Table
+from credo.report import champions, run_page, sections, styles
+from credo.report.sections import Drawing, HeatMap, Table
 from credo.runs.loop import train
 from credo.runs.store import Run
 
@@ -76,6 +77,28 @@ def test_gates_are_named():
         ["h1", "y1", "block input", 1.0],
         ["x1", "h1", "output gate", -0.5],
     ]
+
+
+def test_connections_of_a_unit_with_itself_are_seen_beside_its_marker(monkeypatch):
+    """One at each place of an LSTM cell; the marker reaches 7.5 points from its middle."""
+    paints = []
+
+    def drawing(title, label, paint, caption, height):
+        paints.append(paint)
+        return Drawing(title, "", "", caption)
+
+    monkeypatch.setattr(champions, "drawing", drawing)
+    ports = {(port, 4): 1.0 for port in (1, 2, 3, 4)}
+    champions.graph(made({(0, 4): 1.0} | ports, 1, 1, "lstm"))
+    canvas = Figure(figsize=(7, 3), dpi=72)
+    axes = canvas.add_subplot()
+    paints[0](canvas, axes, styles.LIGHT)
+    canvas.draw_without_rendering()
+    middle = next(text for text in axes.texts if text.get_text() == "h1").get_window_extent()
+    above = [patch.get_window_extent().y1 - (middle.y0 + middle.y1) / 2 for patch in axes.patches]
+    loops = sorted(height for height in above if height > 7.5)
+    assert len(loops) == 4
+    assert np.all(np.diff(loops) > 2)  # and none hides another
 
 
 def test_units_stand_in_columns_by_their_distance_from_the_inputs():
@@ -156,7 +179,7 @@ class TestProbes:
         return list(champions.pictures(run))
 
     def test_the_horizon_curve_has_four_lengths(self, shown):
-        (curve,) = (x for x in shown if isinstance(x, Figure))
+        (curve,) = (x for x in shown if isinstance(x, sections.Figure))
         assert np.asarray(curve.curves[0].x).tolist() == [1, 2, 5, 10]
         assert np.shape(curve.curves[0].runs) == (1, 4)
         assert "× 10: length 30" in curve.caption
@@ -189,4 +212,4 @@ class TestProbes:
 
     def test_no_curve_where_the_task_has_no_setting_for_it(self, tmp_path):
         run = evolved(MMU(hidden=2), tmp_path, Remember(delay=1))
-        assert not [x for x in champions.pictures(run) if isinstance(x, Figure)]
+        assert not [x for x in champions.pictures(run) if isinstance(x, sections.Figure)]

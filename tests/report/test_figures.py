@@ -82,6 +82,19 @@ def test_runs_over_a_setting_are_dots_that_no_line_joins():
     assert figures.note(figure(curves=curves, joined=False)) == told
 
 
+@pytest.mark.parametrize("runs", [1, 3])
+def test_dots_lie_within_the_axes(runs):
+    values = 5.0 + np.random.default_rng(1).random((runs, 3))
+    values[0, 1] = 9.0  # beyond the interval of the mean
+    axes = drawn(figure(curves=[Curve("a", [1, 2, 5], values)], joined=False, references=[])).axes[
+        0
+    ]
+    low, high = axes.get_ylim()
+    assert low <= values.min()
+    assert high >= 9.0
+    assert high - low < 3 * (9.0 - values.min())
+
+
 @pytest.mark.parametrize("last", [3, 7, 40])
 def test_whole_numbers_have_whole_ticks(last):
     x = np.arange(1, last + 1)

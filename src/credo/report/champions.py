@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch
+from matplotlib.transforms import Affine2D, ScaledTranslation
 
 from .. import tree
 from ..analysis.memory import known_memory, weightings
@@ -91,7 +92,7 @@ def graph(policy: GraphPolicy) -> tuple[Drawing, Table]:
         f"{what}. Inputs x and the bias 1 are on the left, outputs y on the right; hidden units h, "
         "squares where they have gates, by the number of connections to them from an input. Warm: "
         "weights above 0, cold: below; the wider, the larger. Bent: to a unit that is not further "
-        "to the right.",
+        "to the right; a loop: to itself.",
         height=max(2.6, 0.42 * max(map(columns.count, columns))),
     )
     return picture, _table(edges)
@@ -165,7 +166,7 @@ def _paint(axes: Axes, theme: Theme, places: dict[str, Place], edges: Sequence[E
     axes.set_axis_off()
     most = max((abs(edge.weight) for edge in edges), default=1.0)
     for edge in edges:
-        axes.add_patch(_arrow(edge, places, abs(edge.weight) / most, theme))
+        axes.add_patch(_arrow(axes, edge, places, abs(edge.weight) / most, theme))
     gated = {edge.end for edge in edges if edge.port}
     for name, (x, y) in places.items():
         look: dict[str, Any] = {"mfc": theme.page, "mec": theme.ink, "mew": 0.9, "zorder": 3}
@@ -178,24 +179,33 @@ def _paint(axes: Axes, theme: Theme, places: dict[str, Place], edges: Sequence[E
         axes.legend(lines, [PORTS[port] for port in ports], loc="lower center", ncols=4, fontsize=8)
 
 
-def _arrow(edge: Edge, places: dict[str, Place], share: float, theme: Theme) -> FancyArrowPatch:
+def _arrow(
+    axes: Axes, edge: Edge, places: dict[str, Place], share: float, theme: Theme
+) -> FancyArrowPatch:
     """`share`: of the largest weight."""
-    (x, y), end = places[edge.start], places[edge.end]
-    itself = edge.start == edge.end
-    bend = 2.2 if itself else 0.0 if end[0] > x else 0.35
+    start, end = places[edge.start], places[edge.end]
+    # Those of two units that end at different gates lie side by side.
+    bend, shrink = (0.0 if end[0] > start[0] else 0.35) + 0.1 * edge.port, (7.0, 8.0)
+    place: dict[str, Any] = {}
+    if edge.start == edge.end:
+        # Out of the top of the unit and back, in points, so that its marker does not hide it.
+        points = Affine2D().scale(1 / 72) + axes.figure.dpi_scale_trans
+        place = {"transform": points + ScaledTranslation(*start, axes.transData), "clip_on": False}
+        start, end, shrink, bend = (-5.0, 6.0), (5.0, 6.0), (0.0, 0.0), -(1.7 + 0.8 * edge.port)
     return FancyArrowPatch(
-        (x + 0.012, y + 0.02) if itself else (x, y),
+        start,
         end,
         connectionstyle=f"arc3,rad={bend}",
         arrowstyle="-|>",
         mutation_scale=7,
-        shrinkA=7,
-        shrinkB=8,
+        shrinkA=shrink[0],
+        shrinkB=shrink[1],
         lw=0.5 + 1.7 * share,
         color=theme.warm if edge.weight > 0 else theme.cold,
         linestyle=DASHES[edge.port],
         alpha=0.85,
         zorder=2,
+        **place,
     )
 
 

@@ -365,6 +365,10 @@ def draw_curve(
     dashes = [x * LINE / width for x in DASHES[look.dash]]
     label = textwrap.fill(curve.label, 56)
     style |= {"color": color, "lw": width, "dashes": dashes, "label": label, "zorder": 3}
+    if place:  # Matplotlib leaves what has a transform of its own out of the limits
+        values = np.vstack(shown[1:])
+        axes.update_datalim(np.column_stack([np.tile(shown.x, len(values)), values.ravel()]))
+        axes.autoscale_view()
     return [*artists, *axes.plot(shown.x, shown.centre, **style, **place)]
 
 
