@@ -39,10 +39,18 @@ def at_least(name: str, value: Any, minimum: float) -> None:
         raise ValueError(f"{name} is {value}: it must be at least {minimum}")
 
 
-def within(name: str, value: Any, low: float, high: float) -> None:
-    """Raise if `value` is a number outside [low, high]. Arrays pass: they may be traced."""
-    if isinstance(value, int | float) and not low <= value <= high:
-        raise ValueError(f"{name} is {value}: it must lie in [{low:g}, {high:g}]")
+def above(name: str, value: Any, limit: float) -> None:
+    """Raise if `value` is a number that is not above `limit`. Arrays pass: they may be traced."""
+    if isinstance(value, int | float) and not value > limit:
+        raise ValueError(f"{name} is {value}: it must be above {limit:g}")
+
+
+def within(name: str, value: Any, low: float, high: float, without: float | None = None) -> None:
+    """Raise if `value` is a number outside [low, high], or is `without`, one of its ends. Arrays
+    pass: they may be traced."""
+    if isinstance(value, int | float) and (not low <= value <= high or value == without):
+        begins, ends = "(" if without == low else "[", ")" if without == high else "]"
+        raise ValueError(f"{name} is {value}: it must lie in {begins}{low:g}, {high:g}{ends}")
 
 
 def signal(given: str | None, known: tuple[str, ...]) -> None:

@@ -1232,5 +1232,16 @@ def test_a_run_that_ends_before_its_task_begins_says_so(credo, tmp_path):
     words = "train neuroevolution sequence-recall --depth 1 --network mmu --population-size 4"
     words += " --infomax infomax --infomax.generations 2 --infomax.episodes 4"
     told = "was evolved for what its memory knows alone, and not for its task"
-    assert told in credo(f"{words} --generations 2 --path {tmp_path / 'a'}")[2]
+    code, _, err = credo(f"{words} --generations 2 --path {tmp_path / 'c'}")
+    assert code == 2
+    assert "infomax.generations is 2 of a run of 2" in err
+    assert "give 3 generations or more" in err
+    assert not (tmp_path / "c").exists()
+    # How many generations a budget of frames has is not known before.
+    assert told in credo(f"{words} --frames 1 --path {tmp_path / 'a'}")[2]
     assert told not in credo(f"{words} --generations 3 --path {tmp_path / 'b'}")[2]
+    again = f"resume {tmp_path / 'b'} --generations 5 --set infomax.generations="
+    code, _, err = credo(f"{again}4")
+    assert code == 1
+    assert "would end the task at generation 3" in err
+    assert credo(f"{again}3")[0] == 0

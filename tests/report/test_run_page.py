@@ -88,7 +88,7 @@ def test_seeds_are_one_curve_and_settings_are_two(page_of, tmp_path):
         ("upper bound", 1.0),
     ]
     assert table.columns == [
-        *("algorithm", "best policy", "baseline", "upper bound", "seeds", "generations")
+        *("algorithm", "champion", "baseline", "upper bound", "seeds", "generations")
     ]
     # The last generation of each run: 0.5 and 0.75.
     name, score, baseline, bound, seeds, generations = table.rows[0]
@@ -163,7 +163,7 @@ def test_a_task_without_a_known_baseline_says_so(page_of, tmp_path):
     algorithm = Neuroevolution(Copy(), MMU(hidden=3), test_episodes=6)
     page = page_of(fake(tmp_path / "a", algorithm, 0, [0.0, 0.5]))
     assert page.sections[0].references == ()
-    assert page.sections[2].columns == ["algorithm", "best policy", "seeds", "generations"]
+    assert page.sections[2].columns == ["algorithm", "champion", "seeds", "generations"]
     assert "No baseline and no upper bound of this task are known." in page.sections[2].caption
     assert page.lead == f"Task: {config.brief(config.to_tree(Copy()))}."
 

@@ -100,7 +100,10 @@ class NEAT(eqx.Module):
     def __check_init__(self):
         if not isinstance(self.network, Graph):
             name = type(self.network).__name__
-            raise ValueError(f"NEAT evolves the topology of a Graph, and {name} has one of its own")
+            raise ValueError(
+                f"NEAT evolves the topology of a Graph, and {name} has one of its own: give "
+                'network=Graph(), or Graph(cells="lstm")'
+            )
         if self.env.agents is not None:
             raise ValueError(
                 f"{type(self.env).__name__} has {self.env.agents} agents and NEAT evolves networks "
@@ -112,6 +115,7 @@ class NEAT(eqx.Module):
         for name in ("population_size", "connections", "species"):
             require.at_least(name, getattr(self, name), 2)
         require.at_least("champions", self.champions, 0)
+        require.above("threshold", self.threshold, 0)
         for name in ("survival", "crossover", "elsewhere", "disabled"):
             require.within(name, getattr(self, name), 0, 1)
         for name in (self.fitness, self.score):

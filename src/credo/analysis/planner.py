@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from .. import require
 from ..compilation import jit
 from ..environments.rover import BRACKETS, CODED_SPEED, Rover, RoverState
 from ..networks.base import AbstractPolicy
@@ -36,6 +37,9 @@ class StraightLines(AbstractPolicy):
     agents: int = eqx.field(static=True)
     coded: bool = eqx.field(static=True, default=False)  # the motion is "as-coded"
     drive: float = 1.0  # share of the full speed, in [0, 1]
+
+    def __check_init__(self):
+        require.within("drive", self.drive, 0, 1)
 
     def start(self, *, key: PRNGKeyArray) -> Float[Array, " agents"]:
         """The turn in radians that is left to make."""

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from .. import require
 from ..compilation import jit
 from ..environments.base import AbstractEnvironment
 from ..networks.base import AbstractPolicy
@@ -22,6 +23,9 @@ class RandomTeam(AbstractPolicy):
     agents: int = eqx.field(static=True)
     size: int = eqx.field(static=True)  # of an action
     amplitude: float = 1.0  # the largest action, in [0, 1]; an array once it is one of a population
+
+    def __check_init__(self):
+        require.within("amplitude", self.amplitude, 0, 1)
 
     def start(self, *, key: PRNGKeyArray) -> PRNGKeyArray:
         return key

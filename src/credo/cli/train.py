@@ -125,6 +125,7 @@ def algorithm_of(line: Line, command: Train) -> Any:
     """The algorithm of a task and network, with all that was typed about them. Raises what they
     raise about their settings, or about one another."""
     word = command.algorithm
+    _leave_out(line, command)
     build, fields = _builder(word, command.preset)
     line.reserved |= fields
     env = _task(line, command)
@@ -174,13 +175,34 @@ def _examples(word: str) -> tuple[str, str]:
     return CATALOGUE["examples"][ALGORITHMS[word].get("learns", "one agent")]
 
 
+def _leave_out(line: Line, command: Train) -> None:
+    """Flags of the command that the algorithm has no use for: no help shows them, and who gives one
+    is told why."""
+    word, entry = command.algorithm, ALGORITHMS[command.algorithm]
+    without = {}
+    if not entry.get("presets"):
+        without["preset"] = f"{word} has no presets"
+    if own := entry.get("topology"):
+        without["network"] = f"{word} {own}, so that no --network can be given"
+    if not hasattr(_class(word), "warm"):
+        able = ", ".join(other for other in ALGORITHMS if hasattr(_class(other), "warm"))
+        without["from_"] = f"{word} cannot start from another run's champion: {able} can"
+    for name, why in without.items():
+        if getattr(command, name) is not None:
+            fail(why)
+        line.flags.pop(name, None)
+
+
+def _class(word: str) -> type:
+    """Of an algorithm."""
+    module, _, name = ALGORITHMS[word]["path"].partition(":")
+    return load(f"{module}:{name.partition('.')[0]}")
+
+
 def _builder(word: str, preset: str | None) -> tuple[Any, set[str]]:
     """What makes the algorithm of a task and a network, and the names of its fields as flags."""
     entry = ALGORITHMS[word]
-    module, _, name = entry["path"].partition(":")
-    cls, presets = load(f"{module}:{name.partition('.')[0]}"), entry.get("presets", ())
-    if preset and not presets:
-        fail(f"{word} has no presets")
+    cls, presets = _class(word), entry.get("presets", ())
     if preset and preset not in presets:
         fail(f"no preset {preset!r} of {word}", preset, presets)
     fields = {f.name.replace("_", "-") for f in dataclasses.fields(cls)}
@@ -214,11 +236,13 @@ def _start(command: Train, algorithm: Any) -> None:
     each came, and whether it learned anything by gradient."""
     from .. import executors
     from ..runs import folder, loop
+    from ..runs.budget import Budget
     from ..runs.store import Run
 
     number = command.seed if command.seeds == 1 else "seeds"
     path = command.path or folder.free_name(algorithm, number)
     options, start = command.options, command.from_
+    or_fail(lambda: Budget.of(algorithm, options).require_task(algorithm))
     first, late = _warm_up(algorithm)
     if not start and options.frames is not None and options.frames <= first:
         say(f"credo: note: {late}")

@@ -58,16 +58,19 @@ class DoublePole(AbstractEnvironment):
     """Whether velocities are observed. Without them they have to be made of what was seen
     before."""
     max_steps: int = eqx.field(static=True, default=1000)  # of 0.02 s, at least 1
-    x: float = 0.0  # position of the cart at the start, m from the middle
+    x: float = 0.0  # position of the cart at the start, m from the middle, at most 2.4
     v: float = 0.0  # its velocity, m/s
-    angle: float = 0.07  # lean of the long pole, rad; the paper's 4°
+    angle: float = 0.07  # lean of the long pole, rad, at most 0.628; the paper's 4°
     spin: float = 0.0  # its velocity, rad/s; the short pole starts upright, at rest
     spread: float = 0.0
     """How far a start is drawn from these, uniformly: 0, not at all; 1, by up to 2.16 m, 1.35 m/s,
-    3.6° and 8.6°/s, the ranges of the papers' test of generalisation."""
+    3.6° and 8.6°/s, the ranges of the papers' test of generalisation; at least 0."""
 
     def __check_init__(self):
         require.at_least("max_steps", self.max_steps, 1)
+        require.at_least("spread", self.spread, 0)
+        require.within("x", self.x, -TRACK, TRACK)
+        require.within("angle", self.angle, -FALLEN, FALLEN)
 
     @property
     def obs_size(self) -> int:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from .. import require
 from ..types import Trace
 
 Shape = Literal[
@@ -41,3 +42,6 @@ class Viewer:
     agent: str = "agent"  # what one of a team is called
     rewards: tuple[str, ...] = ()  # those to be shown; (): all
     speed: float = 5.0  # steps per second at first, above 0
+
+    def __post_init__(self):
+        require.above("speed", self.speed, 0)

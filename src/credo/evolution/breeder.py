@@ -100,7 +100,7 @@ class Breeder(AbstractBreeder):
     tournaments, mates and extinctions; None: one population."""
 
     def __check_init__(self):
-        require.within("elite_fraction", self.elite_fraction, 0, 1)
+        require.within("elite_fraction", self.elite_fraction, 0, 1, without=1)
         require.within("crossover_probability", self.crossover_probability, 0, 1)
         if isinstance(self.crossover, NoCrossover) and self.cross_repeated:
             raise ValueError(

@@ -45,7 +45,7 @@ class CEM(AbstractBreeder):
     decay: float = 0.95  # share of the noise that is left after each generation, in [0, 1]
 
     def __check_init__(self):
-        require.within("parents", self.parents, 0, 1)
+        require.within("parents", self.parents, 0, 1, without=0)
         require.within("decay", self.decay, 0, 1)
         for name in ("start_variance", "least_noise"):
             require.at_least(name, getattr(self, name), 0)

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from .. import require
 from ..networks.graph import Graph, GraphPolicy
 
 NONE = np.int32(np.iinfo(np.int32).max)  # a number behind all others: nothing is here
@@ -167,7 +168,12 @@ class Compatibility(eqx.Module):
     disjoint: float = 1.0  # c2: weight of disjoint genes, at least 0
     weights: float = 0.4  # c3: weight of the mean difference of matching genes' weights, at least 0
     small: int = eqx.field(static=True, default=20)
-    """Genes of the larger genome below which c1 and c2 are not divided by their number."""
+    """Genes of the larger genome below which c1 and c2 are not divided by their number, at least
+    0."""
+
+    def __check_init__(self):
+        for name in ("excess", "disjoint", "weights", "small"):
+            require.at_least(name, getattr(self, name), 0)
 
     def __call__(self, a: Genome, b: Genome) -> Float[Array, ""]:
         match, at = matching(a, b)

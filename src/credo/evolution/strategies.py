@@ -73,8 +73,7 @@ class Strategy(AbstractBreeder):
     def __check_init__(self):
         require.literals(self)
         for name in ("std", "learning_rate"):
-            if (value := getattr(self, name)) is not None and not value > 0:
-                raise ValueError(f"{name} is {value}: it must be above 0")
+            require.above(name, getattr(self, name), 0)
         if self.learning_rate is not None and self.method not in ("Open_ES", "PGPE"):
             raise ValueError(f"{self.method} has no learning_rate: leave it out")
 

@@ -75,7 +75,7 @@ class Coached(AbstractCoach):
     learning_rate: float = 1e-3  # step size of Adam, ≥ 0
 
     def __check_init__(self):
-        require.within("share", self.share, 0, 1)
+        require.within("share", self.share, 0, 1, without=0)
         for name in ("per_update", "learning_rate"):
             require.at_least(name, getattr(self, name), 0)
 

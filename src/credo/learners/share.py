@@ -79,7 +79,7 @@ class Earned(AbstractShare):
     def __check_init__(self):
         require.within("most", self.most, 0, 0.99)
         require.within("least", self.least, 0, self.most)
-        require.within("memory", self.memory, 0, 1)
+        require.within("memory", self.memory, 0, 1, without=0)
         require.at_least("until", self.until, 0)
 
     def first(self) -> float:

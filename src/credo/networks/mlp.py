@@ -277,6 +277,7 @@ def _like(b: Float[Array, "n *batch"], x: Array) -> Array:
 def _check(config: MLP | Critic) -> None:
     for i, units in enumerate((*config.hidden, *getattr(config, "branches", ()))):
         require.at_least(f"hidden[{i}]", units, 1)
+    require.above("output_scale", config.output_scale, 0)
     require.choice("activation", config.activation, ACTIVATIONS)
     require.literals(config)
     require.choice("initializer", config.initializer, (*INITIALIZERS, "uniform"))

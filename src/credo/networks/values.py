@@ -98,8 +98,7 @@ class Histogram(AbstractValues):
     def __check_init__(self):
         require.at_least("atoms", self.atoms, 2)
         for name in ("limit", "blur"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be above 0")
+            require.above(name, getattr(self, name), 0)
 
     @property
     def width(self) -> float:

@@ -70,7 +70,7 @@ def describe(runs: Groups, paths: Sequence[pathlib.Path]) -> Page:
         lead=f"Task: {'; '.join(sorted({_task(c['algorithm']['env']) for c in every}))}.",
         command="credo report " + shlex.join(map(str, paths)),
         sections=[
-            _figure(runs, "champion_score", "Best policy on fresh episodes, as last tested"),
+            _figure(runs, "champion_score", "Champion on fresh episodes, as last tested"),
             *_improved(runs),
             _table(runs),
             *_attributions(runs),
@@ -259,7 +259,7 @@ def _limits(task: Any) -> tuple[Reference, Reference]:
 
 def _table(runs: Groups) -> Table:
     """The last test of every algorithm, beside baseline and upper bound where one has them."""
-    columns = ["algorithm", "best policy", "baseline", "upper bound", "seeds", "generations"]
+    columns = ["algorithm", "champion", "baseline", "upper bound", "seeds", "generations"]
     rows = [_row(label, group) for label, group in runs.items()]
     each = sorted({group[0].config["algorithm"]["test_episodes"] for group in runs.values()})
     episodes = " or ".join(map(str, each))
@@ -267,7 +267,7 @@ def _table(runs: Groups) -> Table:
     if not any(row[2] for row in rows):
         columns, rows = columns[:2] + columns[4:], [row[:2] + row[4:] for row in rows]
         caption += " No baseline and no upper bound of this task are known."
-    return Table("Score of the best policy, as last tested", columns, rows, caption)
+    return Table("Score of the champion, as last tested", columns, rows, caption)
 
 
 def _row(label: str, group: list[Run]) -> list[Cell]:
@@ -287,7 +287,7 @@ def _row(label: str, group: list[Run]) -> list[Cell]:
 
 
 def _attributions(runs: Groups) -> Iterator[Section]:
-    """Of algorithms that recorded it, who changed the best policy last; with learners also where
+    """Of algorithms that recorded it, who changed the champion last; with learners also where
     its weights come from, who had the workers, and what became of the learners' actors."""
     for label, group in runs.items():
         metrics = [run.metrics for run in group]
@@ -297,11 +297,11 @@ def _attributions(runs: Groups) -> Iterator[Section]:
         learners = learner_names(group[0].config["algorithm"].get("learners", ()))
         title = f"{label}: " if len(runs) > 1 else ""
         share = "share of best policies, mean of a tenth of the run"
-        last = f"{title}Who was the last to change the best policy"
+        last = f"{title}Who was the last to change the champion"
         yield _shares(last, share, found, "makers", MAKERS)
         if learners:
             ancestors = [*learners, "first draw"]  # a learner has one colour in both figures
-            origin = f"{title}Where the best policy's weights come from"
+            origin = f"{title}Where the champion's weights come from"
             yield _shares(origin, "expected share", found, "ancestry", ancestors)
         if len(learners) > 1:
             workers = f"{title}Workers of each learner so far"

@@ -39,6 +39,18 @@ class Budget:
             return budget
         return dataclasses.replace(budget, stop_at=options.stop_at)
 
+    def require_task(self, algorithm: Any) -> None:
+        """Raise `ValueError` if a run ends within the generations of its Info-max, whose fitness is
+        not that of the task."""
+        infomax = getattr(algorithm, "infomax", None)
+        first = infomax.generations if infomax else 0
+        if self.generations is not None and infomax and self.generations <= first:
+            raise ValueError(
+                f"infomax.generations is {first} of a run of {self.generations}: networks evolve "
+                f"for the task in what comes after; give {first + 1} generations or more, or "
+                "fewer of infomax"
+            )
+
     @property
     def stop_score(self) -> np.float32:
         """NaN without one: no comparison with it ever stops."""

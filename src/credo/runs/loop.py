@@ -114,6 +114,7 @@ def train(
         raise ValueError(f"seed is {seed}: it must be a whole number from 0 to 2^32 - 1")
     devices.require(options.devices, algorithm.env)
     players.require(options.processes, algorithm.env)
+    Budget.of(algorithm, options).require_task(algorithm)
     path = pathlib.Path(path) if path else free_name(algorithm, seed)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_where(algorithm, options))
@@ -355,8 +356,17 @@ def _changed(run: Run, fit: Any, settings: dict[str, Any], generation: int) -> A
     if "replay_capacity" in settings or _shapes(new) != _shapes(fit):
         told = ", ".join(f"{name}={value!r}" for name, value in settings.items())
         raise RunError(
-            f"{told} changes the sizes of what {run.path} has learned: only numbers that change "
-            "none can be set on the way; start a new run, with --from for its champion"
+            f"{told} changes the sizes or the form of what {run.path} has learned: only numbers "
+            "that change neither can be set on the way; start a new run"
+            + ", with --from for its champion"
+            * hasattr(new, "warm")
+        )
+    was, infomax = (getattr(one, "infomax", None) for one in (fit, new))
+    if was and infomax and was.generations <= generation < infomax.generations:
+        raise RunError(
+            f"infomax.generations={infomax.generations} would end the task at generation "
+            f"{generation}: {run.path} evolves for it since generation {was.generations}; leave it "
+            f"at {generation} or fewer, or start a new run"
         )
     before, tree = run.config["algorithm"], config.to_tree(config.replaced(run.algorithm, settings))
     if tree != before:
