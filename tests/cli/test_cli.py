@@ -188,7 +188,7 @@ def test_wrong_use_says_what_is_wrong_and_what_to_do(credo, words, complaint, he
         (f"{TRAIN} --depth three", "three"),
         (f"{TRAIN} --ties sometimes", "positive"),
         (f"{TRAIN} --netwrk lstm", "did you mean '--network'?"),
-        (f"{TRAIN} --form run", "did you mean '--from'?"),
+        ("train td3 Pendulum-v1 --form run", "did you mean '--from'?"),
         ("resume somewhere --generation 3", "--generations"),
         ("reproduce fig-3.4a --run 3", "--runs"),
     ],
@@ -1218,6 +1218,25 @@ def test_evaluate_says_how_far_memory_reaches(credo, run):
     assert re.match(r"  × 1 +[\d.]+ ± [\d.]+ +depth 2$", once)
     assert re.match(r"  × 3 +[\d.]+( ± [\d.]+)? +depth 6$", thrice)
     assert "horizon is 0: it must be at least 1" in credo(f"evaluate {run} --horizon 0")[2]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ("neat sequence-recall --network lstm", "topology of its networks (--cells"),
+        ("neat sequence-recall --preset ours", "neat has no presets"),
+        ("neat sequence-recall --from run", "neat cannot start from another run's champion: erl,"),
+        ("neuroevolution sequence-recall --from run", "ppo, merl, matd3, maddpg can"),
+    ],
+)
+def test_flags_that_an_algorithm_has_no_use_for_are_refused_and_not_shown(credo, given, told):
+    code, _, err = credo(f"train {given}")
+    assert code == 2
+    assert told in err
+    algorithm, task, flag, _ = given.split()
+    for help in ("--help", "--help-all"):
+        assert f"\n  {flag} " not in credo(f"train {algorithm} {task} {help}")[1]
+    assert "\n  --from " in credo("train td3 Pendulum-v1 --help-all")[1]
 
 
 def test_a_task_without_a_horizon_says_so(credo, tmp_path):

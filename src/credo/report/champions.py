@@ -189,8 +189,9 @@ def _arrow(
     place: dict[str, Any] = {}
     if edge.start == edge.end:
         # Out of the top of the unit and back, in points, so that its marker does not hide it.
+        data: Any = axes.transData
         points = Affine2D().scale(1 / 72) + axes.figure.dpi_scale_trans
-        place = {"transform": points + ScaledTranslation(*start, axes.transData), "clip_on": False}
+        place = {"transform": points + ScaledTranslation(*start, data), "clip_on": False}
         start, end, shrink, bend = (-5.0, 6.0), (5.0, 6.0), (0.0, 0.0), -(1.7 + 0.8 * edge.port)
     return FancyArrowPatch(
         start,

@@ -98,9 +98,9 @@ def _nothing_to_see(run: Run) -> str:
     """What is said of a task that cannot be drawn: which can, and what else shows the run."""
     return (
         f"{type(run.algorithm.env.unwrapped).__name__} has nothing to draw: what can be watched "
-        "are rovers, T-mazes (up to 6 deep), server fleets, sequences, tasks of Gymnasium and "
-        "PettingZoo, and JAX tasks with viewer() or with render(state), which returns a picture "
-        "[height, width, 3]. "
+        "are rovers, T-mazes (up to 6 deep), server fleets, sequence-classification and "
+        "sequence-recall, tasks of Gymnasium and PettingZoo, and JAX tasks with viewer() or with "
+        "render(state), which returns a picture [height, width, 3]. "
         f"`credo report {run.path}` shows what the run has learned"
     )
 
