@@ -473,7 +473,7 @@ def test_teams_need_a_network_and_learners_for_teams(build, told):
         ({"test_every": 0}, "test_every is 0"),
         ({"updates_per_frame": -1.0}, "updates_per_frame is -1"),
         ({"crossover_probability": 1.5}, "crossover_probability is 1.5"),
-        ({"elite_fraction": 1.0}, "leave 1 for offspring"),
+        ({"elite_fraction": 1.0}, r"it must lie in \[0, 1\)"),
         ({"elite_fraction": 0.1}, "must be at least 1"),
         ({"workers": 1, "learners": (LEARNER, LEARNER)}, "1 workers for 2 learners"),
         ({"fitness": "fun"}, "no reward signal 'fun'.*global, local"),

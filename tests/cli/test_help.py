@@ -21,7 +21,9 @@ def test_the_first_screen_is_one_screen(capsys, algorithm):
     assert len(lines) <= 40
     assert max(map(len, lines)) <= 100
     known = {line.split()[0] for line in lines if line.startswith("  --")}
-    assert {"--seed", "--seeds", "--path", "--frames", "--network", "--preset"} <= known
+    assert {"--seed", "--seeds", "--path", "--frames"} <= known
+    assert ("--network" in known) == (algorithm != "neat")  # which makes its own
+    assert ("--preset" in known) == ("presets" in names.ALGORITHMS[algorithm])
     if algorithm in ("erl", "cerl", "td3", "sac", "merl", "ppo"):
         assert {"--gamma", "--learning-rate", "--hidden", "--batch-size"} <= known
     assert lines[-1].startswith("--help-all lists every field")

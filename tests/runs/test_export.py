@@ -343,7 +343,7 @@ def test_a_network_that_the_runner_does_not_know_is_refused(tmp_path):
 
 
 def test_a_champion_that_cannot_act_is_not_written(tmp_path):
-    network = MLP((5,), output_scale=float("nan"))
+    network = MLP((5,), output_scale=float("inf"))
     run = made(tmp_path / "run", plant("unit"), network)
     target = tmp_path / "p.safetensors"
     target.write_text("the one before")

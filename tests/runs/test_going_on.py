@@ -101,7 +101,7 @@ def test_other_settings_go_on_with_what_was_learned(finished, straight):
         ({"learner.gamma": "high"}, "gamma of .*TD3 is 'high': it must be float"),
         ({"learner.class": "os:system"}, "makes another task or method"),
         ({"learner.batch_size": 0}, "batch_size"),
-        ({"replay_capacity": 6000}, "replay_capacity=6000 changes the sizes of what"),
+        ({"replay_capacity": 6000}, "replay_capacity=6000 changes the sizes or the form of what"),
     ],
 )
 def test_what_cannot_be_set_is_refused_and_changes_nothing(finished, changes, told):

@@ -681,7 +681,7 @@ def _check_pois(env: Rover) -> None:
             told = f"{name} has {len(given)} {what} for {env.pois} POIs"
             raise ValueError(f"{told}: give one each")
     for value in env.poi_values or ():
-        require.at_least("a value of poi_values", value, 1e-6)
+        require.at_least("poi_values' value", value, 1e-6)
     for needed in env.poi_couplings or ():
         require.within("a POI's coupling", needed, 1, env.coupling)
     require.within("decoys", env.decoys, 0, env.pois)
