@@ -375,7 +375,7 @@ def test_there_must_be_room_for_elites_and_for_every_learners_actor():
     assert evolved(CERL, elite_fraction=0.5).elites == 3
     with pytest.raises(ValueError, match="at least 1"):
         evolved(CERL, elite_fraction=0.1)
-    with pytest.raises(ValueError, match="lie in .0, 1"):
+    with pytest.raises(ValueError, match=r"lie in \[0, 1\)"):
         evolved(ALGORITHM, elite_fraction=1.0)
 
 
