@@ -84,11 +84,11 @@ def _founded(
     others; and the genome that founds a species, -1: it is an old one, or none."""
     turn = jnp.arange(population.weight.shape[0], dtype=jnp.int32)
     from_all = jax.vmap(distance, in_axes=(0, None))
-    first = jnp.argsort(~alive, stable=True)  # the places of those that there are
+    places = jnp.argsort(~alive, stable=True)  # of those that there are, then the empty ones
 
     def measured(i: Array, away: Array) -> Array:
-        one = tree.take(representative, first[i])
-        return away.at[:, first[i]].set(from_all(population, one))
+        one = tree.take(representative, places[i])
+        return away.at[:, places[i]].set(from_all(population, one))
 
     away = jnp.full((len(turn), len(alive)), jnp.inf)
     away = jax.lax.fori_loop(0, jnp.sum(alive, dtype=jnp.int32), measured, away)

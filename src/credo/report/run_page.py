@@ -296,7 +296,7 @@ def _attributions(runs: Groups) -> Iterator[Section]:
         found = attribution.summary(metrics)
         learners = learner_names(group[0].config["algorithm"].get("learners", ()))
         title = f"{label}: " if len(runs) > 1 else ""
-        share = "share of best policies, mean of a tenth of the run"
+        share = "share of champions, mean of a tenth of the run"
         last = f"{title}Who was the last to change the champion"
         yield _shares(last, share, found, "makers", MAKERS)
         if learners:

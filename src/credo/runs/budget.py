@@ -43,8 +43,9 @@ class Budget:
         """Raise `ValueError` if a run ends within the generations of its Info-max, whose fitness is
         not that of the task."""
         infomax = getattr(algorithm, "infomax", None)
-        first = infomax.generations if infomax else 0
-        if self.generations is not None and infomax and self.generations <= first:
+        if infomax is None or self.generations is None:
+            return
+        if self.generations <= (first := infomax.generations):
             raise ValueError(
                 f"infomax.generations is {first} of a run of {self.generations}: networks evolve "
                 f"for the task in what comes after; give {first + 1} generations or more, or "
